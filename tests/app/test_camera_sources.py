@@ -49,9 +49,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def read(folder: Path, estimator: Asked | None, photo: str = "photo.png", **given: Any) -> Inputs:
+def read(
+    folder: Path,
+    estimator: Asked | None,
+    photo: str | Path = "photo.png",
+    asset: str | Path = "box.glb",
+    **given: Any,
+) -> Inputs:
     """Read the inputs of a run whose camera may be estimated."""
-    paths = {"photo": str(folder / photo), "asset": str(folder / "box.glb")}
+    paths = {"photo": str(folder / photo), "asset": str(folder / asset)}
     config = InsertConfig(**paths, sky="clear", out=str(folder / "out"), **given)
     return read_inputs(config, Loaders(estimator))
 
@@ -198,11 +204,8 @@ def test_doubtful_estimate_asks_for_flags(folder: Path) -> None:
     inputs = read(folder, wide)
     (line,) = [line for line in inputs.notices if "hardly shows" in line]
     assert "pitch and vertical field of view" in line and "--horizon and --fov" in line
-    assert inputs.measured["camera"]["roll_deg"] == {
-        "value": 0.0,
-        "sigma": None,
-        "source": "assumed",
-    }
+    roll = inputs.measured["camera"]["roll_deg"]
+    assert roll == {"value": 0.0, "sigma": None, "source": "assumed"}
     assert not any("hardly shows" in line for line in read(folder, Asked()).notices)
 
 
@@ -251,23 +254,13 @@ def test_check_without_estimator_passes_photos_of_all_shapes(
 ) -> None:
     """What the assumed camera does not see of a narrow photo, the estimated one may."""
     Image.new("RGB", size, (90, 100, 110)).save(tmp_path / "photo.png")
-    config = InsertConfig(
-        photo=str(tmp_path / "photo.png"), asset=str(folder / "box.glb"), sky="clear", out="out"
-    )
-    assert read_inputs(config).camera.width == size[0]
+    assert read(folder, None, tmp_path / "photo.png").camera.width == size[0]
 
 
 def test_width_that_makes_too_many_pixels_is_refused(folder: Path, tmp_path: Path) -> None:
     Image.new("RGB", (2, 900), (90, 100, 110)).save(tmp_path / "photo.png")
-    config = InsertConfig(
-        photo=str(tmp_path / "photo.png"),
-        asset=str(folder / "box.glb"),
-        sky="clear",
-        out="out",
-        width=500,
-    )
     with pytest.raises(InputError, match=r"--width: too many pixels to render .*--max-pixels"):
-        read_inputs(config)
+        read(folder, None, tmp_path / "photo.png", width=500)
 
 
 # ------------------------------------------------------------------------- where nothing is placed
@@ -280,10 +273,7 @@ def test_unplaced_object_is_whole_and_of_a_size_that_is_seen(
 ) -> None:
     """On the ground below the horizon, upright, not cut by the frame, neither tiny nor huge."""
     trimesh.creation.box(extents=(size, 0.6 * size, 0.5 * size)).export(tmp_path / "b.glb")
-    config = InsertConfig(
-        photo=str(folder / "photo.png"), asset=str(tmp_path / "b.glb"), sky="clear", out="out"
-    )
-    inputs = read_inputs(config, Loaders(Asked(pitch_deg=pitch)))
+    inputs = read(folder, Asked(pitch_deg=pitch), asset=tmp_path / "b.glb")
     camera, matrix = inputs.camera, inputs.placement.asset_to_world
     assert sources(inputs)["pitch_deg"] == "estimate"
     corners = inputs.asset.corners() @ matrix[:3, :3].T + matrix[:3, 3]

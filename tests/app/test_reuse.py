@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests import oracles as o
+from tests.app.test_limits import TELL, validated
 from tests.builders.insertions import (
     HALF,
     Run,
@@ -19,6 +20,7 @@ from tests.builders.insertions import (
     digest,
     go,
     read_layers,
+    record_of,
     rgb,
 )
 from tests.builders.refusals import assert_fails
@@ -60,7 +62,7 @@ def again(inputs: Path, run: Path, out: Path, **changes: str | None) -> Run:
 def rewrite(run: Path, name: str, content: bytes) -> None:
     """Replace one file of a run, and its sha256 in ``run.json``."""
     (run / name).write_bytes(content)
-    record = json.loads((run / "run.json").read_text())
+    record = record_of(run)
     record["files"][name] = hashlib.sha256(content).hexdigest()
     (run / "run.json").write_text(json.dumps(record))
 
@@ -237,7 +239,7 @@ def replaced(name: str, make: Callable[[Path], None]) -> Callable[[Path], None]:
 
 def record_with(**changes: Any) -> Callable[[Path], None]:
     def change(run: Path) -> None:
-        record = json.loads((run / "run.json").read_text())
+        record = record_of(run)
         (run / "run.json").write_text(json.dumps({**record, **changes}))
 
     return change
@@ -361,10 +363,5 @@ def test_run_is_never_written_over(
 
 def test_reuse_is_validated_without_renderer(inputs: Path, first: Run, tmp_path: Path) -> None:
     """--validate of a run that reuses another loads neither torch nor Warp."""
-    from tests.app.test_command import run
-
-    argv = arguments(inputs, tmp_path / "o", light=None, reuse=str(first.out))
-    loaded = "print([m for m in ('torch', 'warp', 'diffusers') if m in sys.modules])"
-    done = run([*argv, "--validate"], tmp_path, loaded)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-2:] == ["inputs are valid", "[]"]
+    argv = arguments(inputs, "o", light=None, reuse=str(first.out))
+    assert validated(argv, tmp_path, before=TELL).out.splitlines()[-1] == "loaded []"

@@ -24,7 +24,7 @@ import imageio_ffmpeg
 import pytest
 
 from tests.builders.faults import snapshot
-from tests.builders.insertions import arguments, write_inputs
+from tests.builders.insertions import arguments, record_of, write_inputs
 from warpir.app.command import parse
 from warpir.app.config import DEFAULTS
 from warpir.batch import run as batch
@@ -148,7 +148,7 @@ def check_batch(memory: Path, hooked: Path, count: int, capsys: Any) -> Path:
     after = {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")}
     changed = {path.parent.name for path in after if after[path] != before.get(path)}
     assert changed == {"scene-0", "scene-2"} and failures_of(out) == []
-    assert json.loads((out / "scene-0" / "run.json").read_text())["config"]["seed"] == 77
+    assert record_of(out / "scene-0")["config"]["seed"] == 77
     page = (out / "batch.html").read_text()
     assert all(f'href="{name}/report.html"' in page for name in states_of(out) if name)
     return out
@@ -164,10 +164,7 @@ def test_one_bad_scene_and_one_killed_worker(
     changes = {"seed": "5", "asset": str(memory / "box.obj"), "samples": "1", "depth": "1"}
     argv = arguments(memory, memory / "alone", **changes, no_detail="", no_hand_off="")
     assert insert_main([*argv, "--device", "cpu"]) == ExitCode.DONE
-    files = [
-        json.loads((folder / "run.json").read_text())["files"]
-        for folder in (memory / "alone", out / "scene-5")
-    ]
+    files = [record_of(folder)["files"] for folder in (memory / "alone", out / "scene-5")]
     for listed in files:
         del listed["report.html"]  # which tells the seconds
     assert files[0] == files[1] and len(files[0]) > 5
@@ -282,7 +279,7 @@ def test_a_killed_guided_scene_goes_on_from_its_checkpoint(memory: Path, hooked:
     argv[-1] = str(memory / "other")
     assert main(argv) == ExitCode.DONE
     assert "it starts again" in (memory / "other" / "logs" / "guided.log").read_text()
-    assert json.loads((memory / "other/guided/run.json").read_text())["config"]["seed"] == 5
+    assert record_of(memory / "other/guided")["config"]["seed"] == 5
 
 
 @pytest.mark.slow
@@ -401,16 +398,9 @@ def test_rows_and_flags_become_configurations(tmp_path: Path) -> None:
     assert first.light.file == second.light.file or first.light.file == str(Path.cwd() / "noon.hdr")
     assert (first.placement.at, first.placement.place) == ((3.0, 4.0), None)
     assert first.output.out == str(tmp_path / "out" / "a")
-    assert second.inputs.asset == str(Path.cwd() / "car.glb") and second.placement.place == (
-        0.0,
-        0.0,
-        -5.0,
-    )
-    assert (
-        second.light.file is None
-        and second.light.sun == (10.0, 20.0)
-        and second.camera.height == 2.0
-    )
+    assert second.inputs.asset == str(Path.cwd() / "car.glb")
+    assert second.placement.place == (0.0, 0.0, -5.0) and second.camera.height == 2.0
+    assert second.light.file is None and second.light.sun == (10.0, 20.0)
     assert second.diffusion.model == "someone/some-model"
 
 
@@ -505,10 +495,8 @@ def batch_of(tmp_path: Path, count: int, **changes: Any) -> batch.Batch:
         "".join(json.dumps({"name": f"s{k}", "demo": True, "device": "cpu"}) + "\n"
                 for k in range(count))
     )  # fmt: skip
-    made = batch.Batch(
-        options_of(tmp_path, **changes),
-        read_manifest(tmp_path / "m.jsonl", tmp_path / "out", {}, LIMITS),
-    )
+    manifest = read_manifest(tmp_path / "m.jsonl", tmp_path / "out", {}, LIMITS)
+    made = batch.Batch(options_of(tmp_path, **changes), manifest)
     for scene in made.scenes:
         scene.needs = {"memory": 1 << 30, "disk": 0, "has_place": False, "is_done": False}
     return made
@@ -775,9 +763,7 @@ def test_workers_by_cores_memory_and_devices(
     made.options = options_of(tmp_path, workers=3)
     assert counts() == (3, 2)
     assert made._task(INSERT, 0).config["threads"] == 2
-    for scene in made.scenes:
-        assert scene.row.config is not None
-        scene.row = replace(scene.row, config=scene.row.config.changed(device=None))
+    on_devices(made, *[None] * 5)
     made.options = options_of(tmp_path)
     assert counts(free_host=lambda: 100 << 30) == (2, 4)
     assert [e["CUDA_VISIBLE_DEVICES"] for e in found[-1]] == ["0", "1"]
@@ -914,7 +900,7 @@ def test_ray_is_an_extra(
     assert not (tmp_path / "o").exists()
 
 
-def test_an_address_where_nobody_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_where_nobody_listens(monkeypatch: pytest.MonkeyPatch) -> None:
     """Said at once; sockets raise in tests as they do where a machine cannot be reached."""
 
     def refuse(*arguments: object) -> None:

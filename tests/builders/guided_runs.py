@@ -1,15 +1,16 @@
 """Cheap guided runs on a tiny Stable Diffusion with random weights."""
 
 import json
+import shutil
 from pathlib import Path
 
+from tests.builders.faults import snapshot
+from tests.builders.insertions import arguments, record_of, write_inputs
 from tests.builders.outcome import outcome, without_clock
 
 
 def guided_flags(inputs: Path, out: str | Path, **changes: str | None) -> list[str]:
     """Return a run that the inputs' model guides, as cheap as can be."""
-    from tests.builders.insertions import arguments
-
     flags: dict[str, str | None] = {
         "model": str(inputs / "model"),
         "prompt": "a box",
@@ -29,13 +30,21 @@ def guided_argv(inputs: Path) -> list[str]:
 
 def write_guided_inputs(folder: Path) -> None:
     """Write photo, box, a tiny model, and random weights of the regressor."""
-    from tests.builders.insertions import write_inputs
     from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
     from warpir.train.networks.regressor import random_regressor, save_regressor
 
     write_inputs(folder)
     make_tiny_stable_diffusion(folder / "model")
     save_regressor(random_regressor(1), folder / "regressor.safetensors", {})
+
+
+def old_results(finished: Path, out: Path) -> dict[str, str]:
+    """Put an earlier run's results in a new folder and return what is there."""
+    shutil.copytree(finished, out)
+    record = record_of(out)
+    record["seconds"] = {"of an earlier run": 1.0}
+    (out / "run.json").write_text(json.dumps(record))
+    return snapshot(out)
 
 
 def results_of(out: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import trimesh
 
-from warpir.core.arrays import FloatArray, PixelArray
+from warpir.core.arrays import BoolArray, FloatArray, PixelArray
 from warpir.core.errors import ExitCode
 from warpir.insert import main
 
@@ -160,6 +160,11 @@ def read_layers(path: Path) -> dict[str, FloatArray]:
 def rgb(planes: dict[str, FloatArray], prefix: str = "") -> FloatArray:
     """Three planes of a layer, shape [H, W, 3]."""
     return np.stack([planes[f"{prefix}{c}"] for c in "RGB"], axis=-1)
+
+
+def untouched(planes: dict[str, FloatArray]) -> BoolArray:
+    """Pixels that neither object nor shadow changes, by the layers, shape [H, W]."""
+    return (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
 
 
 def go(argv: list[str], out: Path) -> Run:

@@ -10,13 +10,7 @@ from tools.demo.distance import mesh_distance
 from tools.demo.make import without_fireflies
 from tools.demo.mesh import ellipsoid, lathe, rounded_box, split, tube
 from tools.demo.place import HEIGHT, WIDTH, camera, placement
-from tools.demo.sky import (
-    LUMINANCE,
-    SKY_IRRADIANCE,
-    SUN_TO_SKY,
-    sky,
-    sun_direction,
-)
+from tools.demo.sky import LUMINANCE, SKY_IRRADIANCE, SUN_TO_SKY, sky, sun_direction
 from warpir import demo
 from warpir.app.config import InsertConfig
 from warpir.core.latlong import map_directions, texel_solid_angles
@@ -69,9 +63,8 @@ def test_sky_has_the_stated_energy() -> None:
     for height in (128, 256, 512):
         texels = sky(height) @ LUMINANCE
         direction = map_directions(height, 2 * height)
-        falling = (
-            np.maximum(direction[..., 1], 0.0) * texel_solid_angles(height, 2 * height)[:, None]
-        )
+        angle = texel_solid_angles(height, 2 * height)[:, None]
+        falling = np.maximum(direction[..., 1], 0.0) * angle
         near_sun = direction @ sun_direction() > np.cos(np.radians(3.0))
         total = float((texels * falling).sum())
         assert total == pytest.approx(SKY_IRRADIANCE * (1.0 + SUN_TO_SKY), rel=1e-4)
@@ -176,14 +169,8 @@ def test_meshed_sphere_lies_on_the_sphere() -> None:
     radius = np.linalg.norm(mesh.positions, axis=1)
     np.testing.assert_allclose(radius, 1.0, atol=RADIUS_TOLERANCE)
     np.testing.assert_allclose(mesh.normals, mesh.positions, atol=0.01)
-    volume = (
-        np.einsum(
-            "tk,tk->",
-            mesh.positions[mesh.triangles[:, 0]],
-            np.cross(mesh.positions[mesh.triangles[:, 1]], mesh.positions[mesh.triangles[:, 2]]),
-        )
-        / 6.0
-    )
+    a, b, c = mesh.positions[mesh.triangles.T]
+    volume = np.einsum("tk,tk->", a, np.cross(b, c)) / 6.0
     assert volume == pytest.approx(4.0 / 3.0 * np.pi, rel=0.01)
 
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from tests.builders.faults import Ended, run_case
-from tests.builders.insertions import arguments, read_layers, write_inputs
+from tests.builders.insertions import arguments, read_layers, record_of, write_inputs
 from tests.builders.outcome import outcome
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.optimize.test_recover import CHEAP as GUIDED
@@ -212,7 +212,7 @@ def test_deterministic_is_accepted_on_the_cpu(
     found = run(argv(folder, "regressed", deterministic="", device="cpu"), tmp_path / "a")
     differing = {name for name in plain if found[name] != plain[name]}
     assert differing == {"layers.exr", "report.html", "run.json"}
-    assert json.loads((tmp_path / "a/out/run.json").read_text())["config"]["deterministic"] is True
+    assert record_of(tmp_path / "a/out")["config"]["deterministic"] is True
 
 
 @pytest.mark.slow
@@ -233,7 +233,7 @@ def test_deterministic_repeats_its_bytes_on_a_gpu(
     flags = argv(folder, kind, deterministic="", device="cuda:0", **changes)
     first, second = (run(flags, tmp_path / name) for name in ("a", "b"))
     assert first == second
-    record = json.loads((tmp_path / "a/out/run.json").read_text())
+    record = record_of(tmp_path / "a/out")
     assert record["config"]["deterministic"] is True and record["device"].startswith("cuda")
 
 

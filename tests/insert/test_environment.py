@@ -24,27 +24,19 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize(
-    "device",
-    [pytest.param("cuda:7", id="R8-device-7"), pytest.param("cuda:64", id="R8-device-64")],
+    ("device", "env", "words"),
+    [
+        pytest.param("cuda:7", None, "no device cuda:7", id="R8-device-7"),
+        pytest.param("cuda:64", None, "no device cuda:64", id="R8-device-64"),
+        # A machine without a driver, as which this variable makes any.
+        pytest.param("cuda", {"CUDA_VISIBLE_DEVICES": ""}, "found cpu", id="R8-no-driver"),
+    ],
 )
-def test_device_that_is_not_there(inputs: Path, device: str) -> None:
-    lines = assert_fails(
-        arguments(inputs, "out", device=device), 2, "--device", f"no device {device}", cwd=inputs
-    )
-    assert "--device cpu" in lines[1]
-
-
-@pytest.mark.case("R8")
-def test_cuda_is_absent(inputs: Path) -> None:
-    """A machine without a driver, as which CUDA_VISIBLE_DEVICES makes any."""
-    lines = assert_fails(
-        arguments(inputs, "out", device="cuda"),
-        2,
-        "--device",
-        "found cpu",
-        cwd=inputs,
-        env={"CUDA_VISIBLE_DEVICES": ""},
-    )
+def test_device_that_is_not_there(
+    inputs: Path, device: str, env: dict[str, str] | None, words: str
+) -> None:
+    argv = arguments(inputs, "out", device=device)
+    lines = assert_fails(argv, 2, "--device", words, cwd=inputs, env=env)
     assert "--device cpu" in lines[1]
 
 
@@ -197,13 +189,8 @@ sys.meta_path.insert(0, Hide())
 def test_missing_package(
     inputs: Path, name: str, changes: dict[str, str | None], advice: str
 ) -> None:
-    lines = assert_fails(
-        arguments(inputs, "out", **changes),
-        2,
-        f"{name}: not installed",
-        cwd=inputs,
-        before=HIDDEN.format(name=name),
-    )
+    argv, before = arguments(inputs, "out", **changes), HIDDEN.format(name=name)
+    lines = assert_fails(argv, 2, f"{name}: not installed", cwd=inputs, before=before)
     assert lines[1] == f"pip install {advice} brings it"
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from tests.builders.faults import Ended, run_case, snapshot
-from tests.builders.guided_runs import guided_argv, results_of, write_guided_inputs
+from tests.builders.guided_runs import guided_argv, old_results, results_of, write_guided_inputs
 from tests.builders.outcome import outcome_of
 from warpir.core.errors import InputError
 
@@ -405,13 +405,7 @@ def test_killed_at_random_moments_resumes_to_the_same_bytes(
     met = dict.fromkeys(length, 0)
     for chain in range(CHAINS):
         run = Killable(inputs, tmp_path / f"chain-{chain}")
-        old: dict[str, str] = {}
-        if chain % 2:
-            shutil.copytree(whole.out, run.out)
-            record = json.loads((run.out / "run.json").read_text())
-            record["seconds"] = {"of an earlier run": 1.0}
-            (run.out / "run.json").write_text(json.dumps(record))
-            old = snapshot(run.out)
+        old = old_results(whole.out, run.out) if chain % 2 else {}
         last = "commit" if chain % 3 else "write"
         for phase in ("load", "iteration", "iteration", "checkpoint", last):
             # Of ten steps: after both some are left, and a checkpoint to be killed in.

@@ -1,6 +1,5 @@
 """The look stage end to end: all of it off leaves no trace, and each part reaches the picture."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 from scipy import ndimage
 
-from tests.builders.insertions import arguments, go, read_image, read_layers, rgb
+from tests.builders.insertions import arguments, go, read_image, read_layers, record_of, untouched
 from tests.builders.outcome import outcome
 from warpir.look.camera_look import CameraLook
 
@@ -59,14 +58,14 @@ def test_all_off_gives_the_bytes_of_a_run_without_the_stage(
     look = auto.record["measured"]["look"]
     assert look["blur"]["sigma"] > 0.8 and look["response"]["exponent"] != 1.0
     assert max(max(level) for level in look["grain"]["strength"]) > 1.0 / 255.0
-    record = json.loads((tmp_path / "off" / "out" / "run.json").read_text())
+    record = record_of(tmp_path / "off" / "out")
     assert record["measured"]["look"] == {"blur": None, "grain": None}
     before = read_image(photo)[0]
     for folder in ("auto", "off"):
         codes = read_image(tmp_path / folder / "out" / "composite.png")[0]
         assert codes.dtype == before.dtype == (np.uint8 if bits == 8 else np.uint16)
         planes = read_layers(tmp_path / folder / "out" / "layers.exr")
-        same = (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
+        same = untouched(planes)
         assert 2000 < same.sum() < same.size - 500
         np.testing.assert_array_equal(codes[same], before[same])
     assert (codes != auto.image()).any(axis=-1).sum() > 500

@@ -19,18 +19,26 @@ import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from tests.builders.faults import NO_TORCH, assert_fails
+from tests.builders.faults import NO_TORCH, assert_fails, run_case
 from tests.builders.insertions import arguments, write_inputs
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files
-from warpir.diffusion.models.weight_files import values_hash
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.weight_files import check_lora, check_regressor, values_hash
+from warpir.diffusion.personalization.lora_files import read_lora
 from warpir.train.networks.regressor import random_regressor, save_regressor
 
 WRITTEN = "damaged (its weights are not those that were written)"
 LAYER = "mid_block.attentions.0.transformer_blocks.0.attn2.to_k"
 FLAGS = ("lora", "regressor")
+
+
+def adapter(prefix: str) -> dict[str, Any]:
+    """Tensors of a LoRA of rank 2 for one layer."""
+    a, b = np.ones((2, 32), np.float32), np.ones((64, 2), np.float32)
+    return {f"{prefix}.{LAYER}.lora_A.weight": a, f"{prefix}.{LAYER}.lora_B.weight": b}
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +47,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     write_inputs(folder)
     make_tiny_stable_diffusion(folder / "model")
-    save_file(
-        {
-            f"unet.{LAYER}.lora_A.weight": np.ones((2, 32), np.float32),
-            f"unet.{LAYER}.lora_B.weight": np.ones((64, 2), np.float32),
-        },
-        folder / "lora.safetensors",
-    )
+    save_file(adapter("unet"), folder / "lora.safetensors")
     save_regressor(random_regressor(0, SMALL), folder / "regressor.safetensors", {})
     return folder
 
@@ -202,114 +204,74 @@ def test_answers_that_are_no_light_are_refused(inputs: Path, tmp_path: Path) -> 
     assert_fails(argv, 4, "--regressor", "logarithms beyond 60", cwd=tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("flag", "damage", "words"),
-    [
-        pytest.param(
-            "regressor",
-            describe("format", "warpir-regressor-9"),
-            "'warpir-regressor-9'",
-            id="L2-regressor-newer",
-        ),
-        pytest.param(
-            "regressor", describe("config", "[" * 100_000), "header", id="L2-regressor-nested"
-        ),
-        pytest.param(
-            "regressor",
-            edited(lambda tensors, about: about.pop("config")),
-            "header",
-            id="L2-regressor-no-config",
-        ),
-        *(
-            pytest.param("regressor", configured(**{name: value}), words, id=f"L2-{name}-{value}")
-            for name, value, words in (
-                ("heads", 0, "network: heads"),
-                ("heads", 3, "of 3 heads"),
-                ("heads", [4], "network: heads"),
-                ("heads", 4, "not those that were written"),
-                ("directions", 10**9, "network: directions"),
-                ("depth", 10**7, "network: depth"),
-                ("depth", True, "network: depth"),
-                ("channels", [48, 96, 200_000], "network: channels"),
-                ("channels", [48], "network: channels"),
-                ("dropout", "x", "network: dropout"),
-                ("more", 1, "header is damaged"),
-            )
-        ),
-        *(
-            pytest.param("regressor", change, words, id=f"L2-{words.split(':')[0]}")
-            for change, words in (
-                (as_written(lambda t: t["temperature"].fill(-1.0)), "temperature: not a number"),
-                (as_written(lambda t: t["directions"].fill(0.0)), "directions: not of length 1"),
-                (edited(lambda t, _: t["directions"].fill(0.0)), "not those that were written"),
-            )
-        ),
-        pytest.param(
-            "lora",
-            edited(lambda t, about: t.update(stranger=np.ones(2, np.float32))),
-            "foreign",
-            id="L8-some-foreign",
-        ),
-        pytest.param(
-            "lora",
-            edited(
-                lambda t, about: t.update(
-                    {k: v[:0] if ".lora_A" in k else v[:, :0] for k, v in t.items()}
-                )
-            ),
-            "rank 0",
-            id="L8-rank-0",
-        ),
-        pytest.param(
-            "lora",
-            edited(lambda t, about: t.pop(min(t))),
-            "only one of its two parts",
-            id="L8-one-part",
-        ),
-        pytest.param(
-            "lora",
-            edited(
-                lambda t, about: t.update({min(t): np.ones((2, 77), np.float32)})
-            ),
-            "cross-attention 77; expected 32",
-            id="L8-wrong-base",
-        ),
-        pytest.param(
-            "lora",
-            edited(lambda t, about: t.update({min(t): np.ones((3, 32), np.float32)})),
-            "do not fit",
-            id="L8-parts-do-not-fit",
-        ),
-        pytest.param(
-            "lora",
-            edited(
-                lambda t, about: t.update({"lora_te_x.lora_down.weight": np.ones(2, np.float32)})
-            ),
-            "text encoder",
-            id="L8-text-encoder",
-        ),
-        pytest.param(
-            "lora",
-            edited(
-                lambda t, about: t.update({f"unet.{LAYER}.alpha": np.ones(2, np.float32)})
-            ),
-            "alpha: shape [2] (expected one number)",
-            id="L8-two-alphas",
-        ),
-    ],
-)  # fmt: skip
+def retold(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Path], None]:
+    """Replace tensors, or add others."""
+    return edited(lambda tensors, about: tensors.update(change(tensors)))
+
+
+ONES = np.ones(2, np.float32)
+OTHERS: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "L2-regressor-newer": (
+        "regressor", describe("format", "warpir-regressor-9"), "'warpir-regressor-9'"),
+    "L2-regressor-nested": ("regressor", describe("config", "[" * 100_000), "header"),
+    "L2-regressor-no-config": (
+        "regressor", edited(lambda tensors, about: about.pop("config")), "header"),
+    **{
+        f"L2-{name}-{value}": ("regressor", configured(**{name: value}), words)
+        for name, value, words in (
+            ("heads", 0, "network: heads"),
+            ("heads", 3, "of 3 heads"),
+            ("heads", [4], "network: heads"),
+            ("heads", 4, "not those that were written"),
+            ("directions", 10**9, "network: directions"),
+            ("depth", 10**7, "network: depth"),
+            ("depth", True, "network: depth"),
+            ("channels", [48, 96, 200_000], "network: channels"),
+            ("channels", [48], "network: channels"),
+            ("dropout", "x", "network: dropout"),
+            ("more", 1, "header is damaged"),
+        )
+    },
+    "L2-temperature": (
+        "regressor",
+        as_written(lambda t: t["temperature"].fill(-1.0)), "temperature: not a number"),
+    "L2-directions": (
+        "regressor",
+        as_written(lambda t: t["directions"].fill(0.0)), "directions: not of length 1"),
+    "L2-not those that were written": (
+        "regressor", edited(lambda t, _: t["directions"].fill(0.0)), "not those that were written"),
+    "L8-some-foreign": ("lora", retold(lambda t: {"stranger": ONES}), "foreign"),
+    "L8-rank-0": (
+        "lora",
+        retold(lambda t: {k: v[:0] if ".lora_A" in k else v[:, :0] for k, v in t.items()}),
+        "rank 0"),
+    "L8-one-part": (
+        "lora", edited(lambda t, about: t.pop(min(t))), "only one of its two parts"),
+    "L8-wrong-base": (
+        "lora", retold(lambda t: {min(t): np.ones((2, 77), np.float32)}),
+        "cross-attention 77; expected 32"),
+    "L8-parts-do-not-fit": (
+        "lora", retold(lambda t: {min(t): np.ones((3, 32), np.float32)}), "do not fit"),
+    "L8-text-encoder": (
+        "lora", retold(lambda t: {"lora_te_x.lora_down.weight": ONES}), "text encoder"),
+    "L8-two-alphas": (
+        "lora", retold(lambda t: {f"unet.{LAYER}.alpha": ONES}),
+        "alpha: shape [2] (expected one number)"),
+}  # fmt: skip
+"""Which file is changed, how, and the words of the refusal."""
+
+
+@pytest.mark.parametrize("case", OTHERS)
 def test_weights_that_say_something_else_are_refused(
-    inputs: Path, tmp_path: Path, flag: str, damage: Callable[[Path], None], words: str
+    inputs: Path, tmp_path: Path, case: str
 ) -> None:
-    refused(inputs, tmp_path, flag, damage, words)
+    refused(inputs, tmp_path, *OTHERS[case])
 
 
 @pytest.mark.case("L2")
 @pytest.mark.parametrize("flag", FLAGS)
 def test_a_large_file_is_looked_at_in_pieces(inputs: Path, tmp_path: Path, flag: str) -> None:
     """64 MiB that take no room on the disk take little in memory; too many are not looked at."""
-    from warpir.diffusion.models import weight_files
-    from warpir.diffusion.models.model_error import ModelError
 
     def check(count: int) -> str:
         _, about = tensors_of(inputs / f"{flag}.safetensors")
@@ -329,9 +291,9 @@ def test_a_large_file_is_looked_at_in_pieces(inputs: Path, tmp_path: Path, flag:
         tracemalloc.start()
         try:
             if flag == "lora":
-                weight_files.check_lora(file, None)
+                check_lora(file, None)
             else:
-                weight_files.check_regressor(file)
+                check_regressor(file)
         except ModelError as error:
             return error.what
         finally:
@@ -360,8 +322,6 @@ def test_the_configuration_beside_a_lora_is_an_input(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flag", FLAGS)
 def test_good_files_are_valid(inputs: Path, tmp_path: Path, flag: str) -> None:
     """So that none of the above is refused for another reason."""
-    from tests.builders.faults import run_case
-
     argv = [*run_with(inputs, flag, inputs / f"{flag}.safetensors"), "--validate"]
     ended = run_case(argv, tmp_path, before=NO_TORCH)
     assert (ended.status, ended.err) == (0, "")
@@ -370,15 +330,8 @@ def test_good_files_are_valid(inputs: Path, tmp_path: Path, flag: str) -> None:
 @pytest.mark.case("L8")
 def test_a_configuration_beside_a_lora_is_read_as_json(tmp_path: Path) -> None:
     """peft's, which may be of any size and depth when it comes from a stranger."""
-    from warpir.diffusion.models.model_error import ModelError
-    from warpir.diffusion.personalization.lora_files import read_lora
-
-    tensors = {
-        f"base_model.model.{LAYER}.lora_A.weight": np.ones((2, 32), np.float32),
-        f"base_model.model.{LAYER}.lora_B.weight": np.ones((64, 2), np.float32),
-    }
     file, beside = tmp_path / "adapter_model.safetensors", tmp_path / "adapter_config.json"
-    save_file(tensors, file)
+    save_file(adapter("base_model.model"), file)
     for text in ("[" * 100_000, "[]", '{"r": NaN}', '{"r": 1, "r": 2}', " " * (2**24 + 1)):
         beside.write_text(text)
         with pytest.raises(ModelError, match=r"adapter_config\.json"):
@@ -403,16 +356,9 @@ def test_alpha_patterns_are_names(tmp_path: Path, pattern: str, alpha: float | N
     """By peft they are run as regular expressions; of names the answer is the same as peft's."""
     from peft.utils.other import get_pattern_key
 
-    from warpir.diffusion.models.model_error import ModelError
-    from warpir.diffusion.personalization.lora_files import read_lora
-
-    tensors = {
-        f"unet.{LAYER}.lora_A.weight": np.ones((2, 32), np.float32),
-        f"unet.{LAYER}.lora_B.weight": np.ones((64, 2), np.float32),
-    }
     file = tmp_path / "lora.safetensors"
     config = {"r": 2, "lora_alpha": 4, "alpha_pattern": {pattern: 7}}
-    save_file(tensors, file, {"lora_adapter_metadata": json.dumps(config)})
+    save_file(adapter("unet"), file, {"lora_adapter_metadata": json.dumps(config)})
     if alpha is None:
         with pytest.raises(ModelError, match="alpha_pattern"):
             read_lora(file)
@@ -426,9 +372,6 @@ def test_alpha_patterns_are_names(tmp_path: Path, pattern: str, alpha: float | N
 def test_values_are_looked_at_in_every_kind_of_number(tmp_path: Path, kind: torch.dtype) -> None:
     """The greatest and the smallest numbers are finite; NaN and infinity of either sign are not."""
     from safetensors.torch import save_file as save_tensors
-
-    from warpir.diffusion.models.model_error import ModelError
-    from warpir.diffusion.models.weight_files import check_lora
 
     limits, file = torch.finfo(kind), tmp_path / "lora.safetensors"
     values = torch.tensor([limits.max, limits.min, limits.tiny, -0.0], dtype=kind)

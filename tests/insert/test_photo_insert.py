@@ -18,9 +18,9 @@ from tests.builders.insertions import (
     read_image,
     read_layers,
     rgb,
+    untouched,
     write_photo,
 )
-from warpir.core.arrays import BoolArray, FloatArray
 from warpir.core.errors import ExitCode
 from warpir.insert import main
 from warpir.io.cameras.reader import read_camera
@@ -35,11 +35,6 @@ TURNED_BACK = {  # how an upright image lies in a file: mirrored, turned, both
     6: lambda a: np.rot90(a, 1),
     7: lambda a: np.rot90(a, 2).swapaxes(0, 1),
 }
-
-
-def outside(planes: dict[str, FloatArray]) -> BoolArray:
-    """PixelArray that neither object nor shadow touches, by the layers."""
-    return (planes["matte.A"] == 0.0) & (rgb(planes, "shadow.") == 1.0).all(axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +78,7 @@ def test_untouched_pixels_keep_their_codes(inputs: Path, tmp_path: Path, case: s
         codes = np.asarray(picture.convert("RGB"))
     done = go(arguments(inputs, tmp_path / "out", photo=str(path)), tmp_path / "out")
     found = done.image()
-    kept = outside(read_layers(done.out / "layers.exr"))
+    kept = untouched(read_layers(done.out / "layers.exr"))
     assert found.shape == (*SIZE[::-1], 3) and found.dtype == codes.dtype
     assert 200 < kept.sum() < kept.size - 100
     np.testing.assert_array_equal(found[kept], np.broadcast_to(codes, found.shape)[kept])
@@ -118,7 +113,7 @@ def test_linear_plates_survive_in_the_layers(inputs: Path, tmp_path: Path, case:
     path = write_image(tmp_path / f"p.{case[4:]}", plate)
     done = go(arguments(inputs, tmp_path / "out", photo=str(path)), tmp_path / "out")
     planes = read_layers(done.out / "layers.exr")
-    kept = outside(planes)
+    kept = untouched(planes)
     rounding = 2.0**-7 if case == "I12-hdr" else 2.0**-11  # RGBE of the largest channel; half
     np.testing.assert_allclose(rgb(planes)[kept], plate[kept], rtol=rounding, atol=4 * rounding)
     assert rgb(planes)[kept].max() > 3.9 and kept.sum() > 200
@@ -247,7 +242,7 @@ def test_odd_sizes_are_whole_runs(inputs: Path, tmp_path: Path, size: tuple[int,
     planes = read_layers(done.out / "layers.exr")
     assert done.image().shape == codes.shape
     assert all(np.isfinite(plane).all() for plane in planes.values())
-    kept = outside(planes)
+    kept = untouched(planes)
     np.testing.assert_array_equal(done.image()[kept], codes[kept])
 
 
@@ -262,7 +257,7 @@ def test_photos_without_signal_are_whole_runs(inputs: Path, tmp_path: Path, leve
         planes = read_layers(done.out / "layers.exr")
         assert all(np.isfinite(plane).all() for plane in planes.values())
         assert np.isfinite(read_envmap(done.out / "envmap.exr")).all()
-        assert planes["matte.A"].max() == 1.0
+        assert planes["matte.A"].max() == 1.0 and (done.image()[0, 0] == level).all()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
-from tests.builders.guided_runs import guided_argv, results_of
+from tests.builders.guided_runs import guided_argv, old_results, results_of
+from tests.builders.insertions import arguments
 from warpir.core import signals
 from warpir.core.atomic import manifest_digest
 from warpir.core.errors import ExitCode
@@ -202,15 +203,6 @@ def finished(guided_inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder / "out"
 
 
-def old_results(finished: Path, folder: Path) -> dict[str, str]:
-    """Put an earlier run's results in a folder and return what is there."""
-    shutil.copytree(finished, folder / "out")
-    record = json.loads((folder / "out" / "run.json").read_text())
-    record["seconds"] = {"of an earlier run": 1.0}
-    (folder / "out" / "run.json").write_text(json.dumps(record))
-    return snapshot(folder / "out")
-
-
 def what_is_kept(out: Path, old: dict[str, str]) -> str:
     """Return the name of the newest checkpoint; old results must be whole, and nothing else new."""
     found = snapshot(out) if out.exists() else {}
@@ -254,7 +246,7 @@ def test_stopped_run_keeps_what_it_had(
     kept: str,
 ) -> None:
     """A checkpoint at the border of the step, the old results as they were, no lock."""
-    old = old_results(finished, tmp_path) if kept else {}
+    old = old_results(finished, tmp_path / "out") if kept else {}
     before = hook(place, turn, f"send{(*map(int, numbers),)}")
     ended = guided(guided_inputs, tmp_path, "--overwrite", before=before)
     assert ended.status == 128 + numbers[0], ended.err
@@ -271,7 +263,7 @@ def test_stopped_run_keeps_what_it_had(
 def test_results_that_are_being_put_in_place_are_finished(
     guided_inputs: Path, finished: Path, tmp_path: Path
 ) -> None:
-    old_results(finished, tmp_path)
+    old_results(finished, tmp_path / "out")
     before = hook(COMMIT, 1, f"send({int(TERM)}, {int(TERM)})")
     ended = guided(guided_inputs, tmp_path, "--overwrite", before=before)
     assert ended.status == 143
@@ -298,12 +290,13 @@ def test_stopped_sequence_says_how_many_frames_are_kept(
     guided_inputs: Path, tmp_path: Path
 ) -> None:
     """The second frame stops; the same command then makes the rest only."""
-    argv = lit(guided_inputs, tmp_path)
-    assert run_case([*argv, "--out", "first"], tmp_path, warm=True).status == ExitCode.DONE
+    cheap = {"samples": "1", "depth": "1", "device": "cpu", "no_hand_off": ""}
+    first = arguments(guided_inputs, "first", **cheap)
+    assert run_case(first, tmp_path, warm=True).status == ExitCode.DONE
     lines = "".join(json.dumps({"place": [x, 0, -5]}) + "\n" for x in (0.0, 0.2))
     (tmp_path / "frames.jsonl").write_text(lines)
-    reused = argv[: argv.index("--light")] + argv[argv.index("--light") + 2 :]
-    argv = [*reused, "--reuse", "first", "--sequence", "frames.jsonl", "--out", "out"]
+    changes = {"light": None, "reuse": "first", "sequence": "frames.jsonl"}
+    argv = arguments(guided_inputs, "out", **{**cheap, **changes})
     ended = run_case(argv, tmp_path, before=hook(WRITE, 2, f"send({int(TERM)})"), warm=True)
     assert ended.status == 143
     expected = "stopped by SIGTERM; kept: 1 of 2 frames; the same command goes on with the rest"
@@ -314,15 +307,6 @@ def test_stopped_sequence_says_how_many_frames_are_kept(
     assert ended.status == ExitCode.DONE, ended.err
     # The frame that was killed while its files were put in place is made again.
     assert ended.out.count("done already") == 1
-
-
-def lit(guided_inputs: Path, folder: Path) -> list[str]:
-    """Return a cheap run under a known light, but for its --out."""
-    from tests.builders.insertions import arguments
-
-    argv = arguments(guided_inputs, "", samples="1", depth="1", device="cpu", no_hand_off="")
-    place = argv.index("--out")
-    return argv[:place] + argv[place + 1 + (argv[place + 1] == "") :]
 
 
 COMPILED = """
@@ -402,7 +386,7 @@ def test_full_disk_keeps_old_results_and_checkpoints(
     guided_inputs: Path, finished: Path, tmp_path: Path, limit: int
 ) -> None:
     """Wherever the disk is full first: preview, checkpoint, LoRA, EXR."""
-    old = old_results(finished, tmp_path)
+    old = old_results(finished, tmp_path / "out")
     ended = guided(guided_inputs, tmp_path, "--overwrite", file_size=limit)
     assert ended.status == ExitCode.RESOURCES, ended.err
     errors = [line for line in ended.err.splitlines() if line.startswith("error:")]
@@ -462,7 +446,7 @@ def test_output_folder_that_vanishes(
 def test_output_folder_that_becomes_read_only(
     guided_inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
 ) -> None:
-    old = old_results(finished, tmp_path)
+    old = old_results(finished, tmp_path / "out")
     # What is open for writing cannot become read-only, so that another disk comes on top.
     command = ["mount", "-t", "tmpfs", "-o", "ro", "none", "out"]
     small_disk("4k")  # skips where nothing can be mounted

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import pytest
 
 import warpir.report.result
-from tests.builders.insertions import ALWAYS, Run, arguments, digest, go
+from tests.builders.insertions import ALWAYS, Run, arguments, digest, go, record_of
 from tests.builders.refusals import assert_fails, refused
 from warpir import insert
 from warpir.app.command import parse
@@ -97,14 +97,12 @@ def test_sequence_writes_complete_folders(
         folder = out / frame["folder"]
         assert {p.name for p in folder.iterdir()} == {*ALWAYS, "run.json"}
         assert frame["run"] == hashlib.sha256((folder / "run.json").read_bytes()).hexdigest()
-        config = json.loads((folder / "run.json").read_text())["config"]
+        config = record_of(folder)["config"]
         assert config["sequence"] is None and config["out"] == str(folder)
-    third = json.loads((out / "0003" / "run.json").read_text())["config"]
+    third = record_of(out / "0003")["config"]
     assert third["at"] == [24.0, 24.0] and third["place"] is None
-    light = [
-        hashlib.sha256((out / f / "envmap.exr").read_bytes()).digest() for f in ("0001", "0002")
-    ]
-    assert light[0] == light[1]
+    light, other = ((out / f / "envmap.exr").read_bytes() for f in ("0001", "0002"))
+    assert light == other
 
 
 def test_frame_is_the_single_runs_twin(
@@ -114,7 +112,7 @@ def test_frame_is_the_single_runs_twin(
     _, out = frames
     changes = {"asset": str(inputs / "box.obj"), "place": "0.3,0,-5", "rotate_y": "20"}
     argv = arguments(inputs, tmp_path / "a", light=None, reuse=str(first.out), **FAST, **changes)
-    frame = json.loads((out / "0002" / "run.json").read_text())
+    frame = record_of(out / "0002")
     single = go(argv, tmp_path / "a")
     replay = ["--config", str(out / "0002" / "run.json"), "--out", str(tmp_path / "b")]
     replayed = go(replay, tmp_path / "b")
@@ -175,9 +173,8 @@ def test_interrupted_sequence_goes_on(
     assert main(argv) == ExitCode.DONE
     assert len(calls) == 4 and "frame 0001: done already" in capsys.readouterr().out
     for folder in ("0001", "0002", "0003"):
-        files = [json.loads((o / folder / "run.json").read_text())["files"]
-                 for o in (finished, tmp_path / "out")]  # fmt: skip
-        assert files[0]["composite.png"] == files[1]["composite.png"]
+        one, other = (record_of(o / folder)["files"] for o in (finished, tmp_path / "out"))
+        assert one["composite.png"] == other["composite.png"]
 
 
 def test_other_results_are_not_replaced(
@@ -203,7 +200,7 @@ def test_other_results_are_not_replaced(
     argv = argv_of(inputs, first, other, out)
     assert_fails(capsys, argv, ExitCode.OUTPUT, "one.jsonl:1:")
     assert main([*argv, "--overwrite"]) == ExitCode.DONE
-    assert json.loads((out / "0001" / "run.json").read_text())["config"]["seed"] == 6
+    assert record_of(out / "0001")["config"]["seed"] == 6
     capsys.readouterr()
     # What --overwrite wrote is done for the command without it.
     assert main([*argv, "--validate"]) == ExitCode.DONE
@@ -225,8 +222,7 @@ def test_renewed_sequence_keeps_what_is_done(
         insert_now(config, renews=True)
     insert_now(config, renews=True)
     assert len(calls) == 3 and "it is rendered again" in capsys.readouterr().out
-    seeds = [json.loads((out / f"000{k}" / "run.json").read_text())["config"]["seed"]
-             for k in (1, 2, 3)]  # fmt: skip
+    seeds = [record_of(out / f"000{k}")["config"]["seed"] for k in (1, 2, 3)]
     assert seeds == [3, 9, 9], "the first as the command line says"
     (out / "0002" / "layers.exr").write_bytes(b"edited")
     with pytest.raises(InputError, match="changed since the run wrote it"):
@@ -243,11 +239,7 @@ def test_batch_looks_at_all_that_a_sequence_takes(
         config = parse(argv_of(inputs, first, listed, out)).config
         return do_task(Task(CHECK, config.flat()))
 
-    whole, one, two = (
-        check(tmp_path / "none", *FRAMES),
-        check(tmp_path / "none", FRAMES[0]),
-        check(tmp_path / "none", *FRAMES[:2]),
-    )
+    one, two, whole = (check(tmp_path / "none", *FRAMES[:count]) for count in (1, 2, 3))
     assert 0 < one.found["memory"] <= two.found["memory"] <= whole.found["memory"]
     assert 0 < one.found["disk"] < two.found["disk"] < whole.found["disk"]
     copy_of(frames[1], tmp_path / "out")
@@ -318,11 +310,8 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
     gone = [configs[1].camera.fov, configs[1].camera.pitch, configs[1].camera.height]
     assert gone == [None] * 3 and configs[1].placement.place == (0.0, 0.0, -5.0)
     assert configs[2].camera.pitch is None and configs[2].camera.fov == 60.0
-    assert (
-        configs[3].camera.fov == 50.0
-        and configs[3].camera.pitch == -15.0
-        and configs[3].placement.scale is None
-    )
+    assert (configs[3].camera.fov, configs[3].camera.pitch) == (50.0, -15.0)
+    assert configs[3].placement.scale is None
     inside = [pair for pair in EXCLUSIVE if set(pair) <= set(FRAME_FIELDS)]
     assert len(inside) == 9
 
@@ -372,7 +361,7 @@ def test_folder_of_a_single_run_is_no_place_for_a_sequence(
     assert digest(first.out) == before
 
 
-def test_sequence_needs_photo_and_asset_on_every_line_or_once(tmp_path: Path) -> None:
+def test_sequence_needs_photo_and_asset_on_every_line_or_once() -> None:
     """The command line need not name what every line names."""
     config = InsertConfig(out="o", reuse="r", sequence="s.jsonl")
     config.require_inputs()

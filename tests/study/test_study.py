@@ -278,16 +278,21 @@ def votes_with(preferred: int, scenes: int, total: int | None = None) -> list[in
     return votes
 
 
-def constructed_study(
-    folder: Path, pairs: Sequence[Pair], votes: Sequence[Mapping[int, int]]
-) -> None:
-    """Write a study without pages, and answers that hold these votes of 9, by run and pair."""
-    plan = make_plan(pairs, raters=9, runs=len(votes), seed=1)
-    study = Study(plan, "DiPIR", 9, len(votes), 0, "constructed")
+def write_study(folder: Path, plan: Plan, raters: int, runs: int) -> None:
+    """Write a study without pages."""
+    study = Study(plan, "DiPIR", raters, runs, 0, "constructed")
     folder.mkdir()
     protocol = protocol_bytes(study, Words())
     (folder / "study.json").write_bytes(protocol)
     (folder / "key.json").write_bytes(key_bytes(study, protocol, [{} for _ in plan.pairs]))
+
+
+def constructed_study(
+    folder: Path, pairs: Sequence[Pair], votes: Sequence[Mapping[int, int]]
+) -> None:
+    """Write a study and answers that hold these votes of 9, by run and pair."""
+    plan = make_plan(pairs, raters=9, runs=len(votes), seed=1)
+    write_study(folder, plan, 9, len(votes))
     sheets = []
     for index, rater in enumerate(plan.raters):
         of_run, turn = votes[rater.run - 1], index % 9
@@ -421,12 +426,7 @@ def test_scenes_without_votes_are_told_once(
     pairs = [Pair(f"s{k}", group, "grouped") for k, group in enumerate(groups)]
     pairs += [Pair("s0", "", "plain"), Pair("s1", "", "plain")]
     plan = make_plan(pairs, raters=1, runs=1, seed=1, pairs_per_rater=1)
-    study = Study(plan, "ours", 1, 1, 0, "constructed")
-    (tmp_path / "study").mkdir()
-    protocol = protocol_bytes(study, Words())
-    (tmp_path / "study" / "study.json").write_bytes(protocol)
-    key = key_bytes(study, protocol, [{} for _ in plan.pairs])
-    (tmp_path / "study" / "key.json").write_bytes(key)
+    write_study(tmp_path / "study", plan, 1, 1)
     seen = next(k for k, rater in enumerate(plan.raters) if rater.trials[0].pair == 0)
     write_answers(tmp_path / "study", [sheet_of(plan, seen)])
     score(tmp_path / "study", "--markdown", str(tmp_path / "table.md"))
@@ -511,7 +511,7 @@ def test_a_seed_makes_the_same_study_and_none_another(scenes: Path, tmp_path: Pa
     assert not set(content("c")) & set(content("d")) - {"key.json", "study.json"}
 
 
-def test_texts_of_a_manifest_are_escaped(tmp_path: Path) -> None:
+def test_texts_of_a_manifest_are_escaped() -> None:
     pairs = [Pair(HOSTILE, HOSTILE, HOSTILE)]
     plan = make_plan(pairs, raters=1, runs=1, seed=1)
     words = Words(HOSTILE, HOSTILE + "{title}", HOSTILE, HOSTILE)
@@ -577,11 +577,13 @@ def manifest_of() -> dict[str, Any]:
 # ------------------------------------------------------------------------------- the refusals
 
 
+AS_STUDY: dict[str, str] = {"program": "warpir.study.command", "before": NO_TORCH}
+"""For `run_case` and `assert_fails`: neither torch nor Warp is looked at."""
+
+
 def refuse(argv: Sequence[str], code: int, *words: str, cwd: Path) -> list[str]:
-    """Check a refusal, and that neither torch nor Warp is looked at."""
-    return assert_fails(
-        argv, code, *words, cwd=cwd, program="warpir.study.command", before=NO_TORCH
-    )
+    """Check a refusal."""
+    return assert_fails(argv, code, *words, cwd=cwd, **AS_STUDY)
 
 
 MAKE = ("make", "scenes", "--method", METHOD, "--out", "study")
@@ -599,10 +601,7 @@ BAD_MANIFESTS: dict[str, tuple[Callable[[dict[str, Any]], Any], tuple[str, ...]]
     "scenes": (lambda m: m | {"scenes": []}, ("/scenes", "an object expected")),
     "no pairs": (lambda m: m | {"scenes": {}}, ("no pairs",)),
     "no method's image": (lambda m: m | {"method": "other"}, ("no image of the method 'other'",)),
-    "one image": (
-        lambda m: set_scene(m, images={METHOD: f"scene-0/{METHOD}.png"}),
-        ("no pairs",),
-    ),
+    "one image": (lambda m: set_scene(m, images={METHOD: "scene-0/photo.png"}), ("no pairs",)),
     "missing image": (lambda m: set_scene(m, photo="gone.png"), ("gone.png", "no such file")),
     "long file name": (lambda m: set_scene(m, photo="x" * 300), ("xxx", "no such file")),
     "NUL": (lambda m: set_scene(m, photo="x\0.png"), ("no such file",)),
@@ -672,7 +671,7 @@ def test_a_study_is_never_written_over(scenes: Path, tmp_path: Path) -> None:
 
 
 def test_make_needs_neither_torch_nor_warp(scenes: Path, tmp_path: Path) -> None:
-    ended = run_case(MAKE, tmp_path, program="warpir.study.command", before=NO_TORCH)
+    ended = run_case(MAKE, tmp_path, **AS_STUDY)
     assert ended.status == 0, ended
     assert "2 pairs against 1 baselines, 1 catch pairs" in ended.out
     assert not list(tmp_path.glob(".partial*"))
@@ -818,7 +817,7 @@ def test_answers_of_people_are_scored_without_a_warning(scenes: Path, tmp_path: 
     """The form of what a browser saves; nobody's opinion here either, and thrown away."""
     study = make(scenes, tmp_path / "study")
     write_answers(tmp_path / "study", [sheet_of(study.plan, 0, source=BROWSER)])
-    ended = run_case(["score", "study"], tmp_path, program="warpir.study.command", before=NO_TORCH)
+    ended = run_case(["score", "study"], tmp_path, **AS_STUDY)
     assert ended.status == 0, ended
     assert "AUTOMATED" not in ended.out and "1 of 3 raters" in ended.out
 
