@@ -263,31 +263,14 @@ def _not_plain(name: str, value: object, prompt_limit: int) -> Iterator[InputErr
 
 
 EXCLUSIVE = (
-    ("demo", "photo"),
-    ("demo", "asset"),
-    ("demo", "camera"),
-    ("camera", "fov"),
-    ("camera", "pitch"),
-    ("camera", "roll"),
-    ("camera", "horizon"),
-    ("camera", "camera_height"),
-    ("pitch", "horizon"),
-    ("ground", "ground_points"),
-    ("place", "at"),
-    ("scale", "size"),
-    ("light", "sun"),
-    ("light", "sky"),
-    ("light", "start"),
-    ("sun", "start"),
-    ("sky", "start"),
-    ("reuse", "start"),
-    ("reuse", "demo"),
-    ("reuse", "light"),
-    ("reuse", "sun"),
-    ("reuse", "sky"),
-    ("sequence", "refine"),
-    ("resume", "overwrite"),
-)
+    ("demo", "photo"), ("demo", "asset"), ("demo", "camera"),
+    ("camera", "fov"), ("camera", "pitch"), ("camera", "roll"), ("camera", "horizon"),
+    ("camera", "camera_height"), ("pitch", "horizon"), ("ground", "ground_points"),
+    ("place", "at"), ("scale", "size"),
+    ("light", "sun"), ("light", "sky"), ("light", "start"), ("sun", "start"), ("sky", "start"),
+    ("reuse", "start"), ("reuse", "demo"), ("reuse", "light"), ("reuse", "sun"), ("reuse", "sky"),
+    ("sequence", "refine"), ("resume", "overwrite"),
+)  # fmt: skip
 """Pairs of fields of which at most one may be given."""
 
 

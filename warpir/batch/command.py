@@ -109,12 +109,8 @@ def _read_arguments(arguments: list[str]) -> tuple[Options, dict[str, Any]]:
         text = texts.pop(name, None)
         if text is None:
             return None
-        if (
-            not text.isascii()
-            or not text.isdigit()
-            or len(text) > 9
-            or not (low <= int(text) <= high)
-        ):
+        is_number = text.isascii() and text.isdigit() and len(text) <= 9
+        if not (is_number and low <= int(text) <= high):
             raise usage(f"--{name}", f"a whole number, {low} to {high} (found {text[:60]})")
         return int(text)
 
