@@ -316,30 +316,14 @@ def stand_on_ground(
 ) -> Placement:
     """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
 
+    It stands where it was asked for, or where the points leave space.
+
     Raises:
         InputError: There is no such place, or no free one, or the object would be below the ground.
     """
-    return settled(
-        _stood(asked, asset, world, mesh, is_plane),
-        asset.corners(),
-        mesh,
-        is_plane=is_plane,
-        settles=asked.settle,
-        sink=asked.sink,
-    )
-
-
-def _stood(
-    asked: PlacementConfig,
-    asset: Asset,
-    world: PhotoWorld,
-    mesh: ReceiverMesh | None,
-    is_plane: bool,
-) -> Placement:
-    """Place the asset where it was asked for, or where the points leave space."""
     low, high = asset.bounds()
 
-    def put(place: tuple[float, float, float] | None, size: float | None = None) -> Placement:
+    def put(place: Place | None, size: float | None = None) -> Placement:
         return place_asset(
             low,
             high,
@@ -356,15 +340,21 @@ def _stood(
 
     if world.place is None and asked.at is None:
         is_sized = asked.size is not None or asked.scale is not None
-        return _set_free(put, asset, world, mesh, is_sized)
-    placement = put(world.place)
-    if world.cloud is None:
-        return placement
-    stand = Stand(placement.asset_to_world, low, high, world.camera)
-    if count := len(stand.points_in_way(world.cloud)):
-        warning = f"{count} points of --ground-points stand where the object does; is it free?"
-        placement = replace(placement, warnings=(*placement.warnings, warning))
-    return placement
+        placement = _set_free(put, asset, world, mesh, is_sized)
+    else:
+        placement = put(world.place)
+        stand = Stand(placement.asset_to_world, low, high, world.camera)
+        if world.cloud is not None and (count := len(stand.points_in_way(world.cloud))):
+            warning = f"{count} points of --ground-points stand where the object does; is it free?"
+            placement = replace(placement, warnings=(*placement.warnings, warning))
+    return settled(
+        placement,
+        asset.corners(),
+        mesh,
+        is_plane=is_plane,
+        settles=asked.settle,
+        sink=asked.sink,
+    )
 
 
 def _set_free(
