@@ -9,6 +9,7 @@ command line, radians everywhere inside.
 import math
 import re
 from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -170,6 +171,16 @@ def flag(name: str) -> str:
 def usage(where: str, what: str, advice: str = "") -> InputError:
     """Make the error of a wrong command line or configuration."""
     return InputError(where, what, advice, ExitCode.USAGE)
+
+
+@contextmanager
+def as_usage() -> Iterator[None]:
+    """Let errors in the block be those of a wrong configuration, whatever found them."""
+    try:
+        yield
+    except InputError as error:
+        error.code = ExitCode.USAGE
+        raise
 
 
 LARGEST = 1e9

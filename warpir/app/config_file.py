@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from warpir.app.config import DEFAULTS, DOTTED, usage
+from warpir.app.config import DEFAULTS, DOTTED, as_usage, usage
 from warpir.app.record import RUN_FORMAT
-from warpir.core.errors import LISTED, SHOWN, ExitCode, InputError, raise_all, shown
+from warpir.core.errors import LISTED, SHOWN, raise_all, shown
 from warpir.core.limits import Limits
 from warpir.core.strict_json import read_json_object
 
@@ -70,11 +70,8 @@ def by_name(where: str, content: Mapping[Any, Any]) -> dict[str, Any]:
 def _load(path: str, limits: Limits) -> Any:
     """Parse a file into plain values: JSON by its extension, anything else as YAML."""
     if Path(path).suffix.lower() == ".json":
-        try:
+        with as_usage():
             return read_json_object(path, limits)
-        except InputError as error:
-            error.code = ExitCode.USAGE
-            raise
     import yaml
 
     try:
@@ -123,7 +120,8 @@ def _yaml_loader(path: str, limits: Limits) -> Callable[[str], Any]:
 
         def deeper(self, compose: Callable[[Any], Any], anchor: Any) -> Any:
             self.level += 1
-            _within(limits, "nesting", self.level, path, "nested too deeply", " levels")
+            with as_usage():
+                limits.check("nesting", self.level, path, "nested too deeply", more=" levels")
             node = compose(anchor)
             self.level -= 1
             return node
@@ -136,22 +134,14 @@ def _yaml_loader(path: str, limits: Limits) -> Callable[[str], Any]:
     return Loader
 
 
-def _within(limits: Limits, name: str, found: int, path: str, what: str, more: str) -> None:
-    """As `Limits.check`, with the status of a wrong configuration."""
-    try:
-        limits.check(name, found, path, what, more=more)
-    except InputError as error:
-        error.code = ExitCode.USAGE
-        raise
-
-
 def _read_text(path: str, limits: Limits) -> str:
     try:
         status = Path(path).stat()
         if not stat.S_ISREG(status.st_mode):
             raise usage(path, "not a regular file")
         limit = replace(limits, json_bytes=limits.json_bytes // YAML_SHARE)
-        _within(limit, "json_bytes", status.st_size, path, "too large for YAML", " bytes")
+        with as_usage():
+            limit.check("json_bytes", status.st_size, path, "too large for YAML", more=" bytes")
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise usage(path, "not UTF-8 text") from None

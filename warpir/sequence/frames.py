@@ -20,7 +20,7 @@ from typing import Any
 
 import warpir
 from warpir.app.command import read_values
-from warpir.app.config import DEFAULTS, InsertConfig, replaced_by, usage
+from warpir.app.config import DEFAULTS, InsertConfig, as_usage, replaced_by, usage
 from warpir.app.config_file import by_name
 from warpir.app.finished import OtherRun, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
@@ -260,11 +260,8 @@ def _run_digest(frame: Frame) -> str:
 
 def _read_line(config: InsertConfig, number: int, line: int, raw: bytes) -> Frame:
     where = f"{config.task.sequence}:{line}"
-    try:
+    with as_usage():
         content = parse_json_object(where, raw, config.limits)
-    except InputError as error:
-        error.code = ExitCode.USAGE
-        raise
     given = by_name(where, content)
     raise_all(
         [
