@@ -2,9 +2,11 @@
 // Ground frame: right-handed, +Y up, metres, the ground is y = 0; the camera looks along its -Z.
 // Pixels of the upright photo: origin top left, v down. Angles are degrees.
 
-const RADIANS = Math.PI / 180;
+export const RADIANS = Math.PI / 180;
 export const STEEPEST = 89;
 export const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+export const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const steep = (pitch) => clamp(pitch, -STEEPEST, STEEPEST);
 
 // Camera to ground frame, rows of turn_y(heading) turn_x(pitch) turn_z(roll).
@@ -49,6 +51,11 @@ export function project(camera, stance, point) {
     camera.cx - (camera.fx * local[0]) / local[2],
     camera.cy + (camera.fy * local[1]) / local[2],
   ];
+}
+
+// Whether the photo shows a point, given its pixel or null.
+export function isShown(camera, pixel) {
+  return pixel && pixel[0] >= 0 && pixel[0] <= camera.width && pixel[1] >= 0 && pixel[1] <= camera.height;
 }
 
 // Direction through a pixel, not of unit length.

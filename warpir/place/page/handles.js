@@ -1,6 +1,6 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
-import { clamp, corners, groundPoint, horizonRow, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
+import { clamp, corners, groundPoint, horizonRow, isShown, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
 
 const RIM = 14; // handles stay this far inside the stage
 const APART = 26; // between the middles of an object's knobs
@@ -50,8 +50,7 @@ export function withCamera(unchanged, camera, stance) {
   const before = { ...unchanged, lamps: carriedLamps(unchanged, camera, stance) };
   const { stand } = before;
   const foot = project(before.camera, before.stance, [stand.x, 0, stand.z]);
-  const isSeen = foot && foot[0] >= 0 && foot[0] <= camera.width && foot[1] >= 0 && foot[1] <= camera.height;
-  if (!isSeen) return { ...before, camera, stance };
+  if (!isShown(camera, foot)) return { ...before, camera, stance };
   const away = (point, from) => Math.hypot(point[0] - from.x, point[1] - from.z) / from.height;
   const most = Math.min(CARRIED * Math.max(away([stand.x, stand.z], before.stance), 1), FARTHEST);
   const pointAt = (v) => {
@@ -78,8 +77,7 @@ function carriedLamps(before, camera, stance) {
   const { x, z, height } = before.stance;
   return before.lamps.map((lamp) => {
     const pixel = project(before.camera, before.stance, lamp.center);
-    const isSeen = pixel && pixel[0] >= 0 && pixel[0] <= camera.width && pixel[1] >= 0 && pixel[1] <= camera.height;
-    if (!isSeen) return lamp;
+    if (!isShown(camera, pixel)) return lamp;
     const away = Math.hypot(lamp.center[0] - x, lamp.center[1] - height, lamp.center[2] - z);
     return { ...lamp, center: pointSeen(camera, stance, pixel, (away * stance.height) / height, lamp.radius ?? 0) };
   });

@@ -1,6 +1,6 @@
 // The light on the page: the user's sun and sky, else what is estimated from the photo.
 
-import { clamp, project, sunAxis } from './camera.js';
+import { clamp, cross, dot, project, sunAxis } from './camera.js';
 import { follow, shape } from './handles.js';
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
@@ -9,7 +9,6 @@ const RADIUS = 46; // of the dial
 const LEAST_FROM_AFAR = 0.05; // of the ground's light, whatever lamps near it give
 const PATIENCE = 1200; // ms that a camera must rest before the light is estimated for it
 
-const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
 
 // What a lamp near the object sends toward a point: the irradiance of what faces it at 1 m, RGB. A
 // rectangle shines on one side, and less aslant.
@@ -17,7 +16,7 @@ export function lampStrength({ center, edge_x: a, edge_y: b, power, color }, poi
   const all = color.map((part) => (part * power) / (4 * Math.PI));
   if (!a) return all;
   const offset = point.map((part, k) => part - center[k]);
-  const normal = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const normal = cross(a, b);
   const cosine = dot(normal, offset) / (Math.hypot(...normal) * Math.hypot(...offset) || 1);
   return all.map((part) => 4 * part * Math.max(cosine, 0));
 }
@@ -262,9 +261,7 @@ export class Dial {
     const axis = sunAxis(azimuth, elevation);
     const level = Math.hypot(axis[0], axis[2]) || 1;
     const across = [-axis[2] / level, 0, axis[0] / level];
-    const along = [
-      axis[1] * across[2], axis[2] * across[0] - axis[0] * across[2], -axis[1] * across[0],
-    ];
+    const along = cross(axis, across);
     return Array.from({ length: 49 }, (_, k) => {
       const [c, s] = [Math.cos((k * Math.PI) / 24), Math.sin((k * Math.PI) / 24)];
       const d = axis.map((part, i) => Math.cos(spread) * part + Math.sin(spread) * (c * across[i] + s * along[i]));

@@ -5,14 +5,10 @@
 // of them; three give P as well, the orthocentre of their triangle (Caprile and Torre 1990).
 // Points are homogeneous, [x, y, w], in pixels over the photo's width: parallel lines meet at w = 0.
 
-import { horizonRow, levelled, rotation } from './camera.js';
+import { cross, dot, horizonRow, levelled, RADIANS, rotation } from './camera.js';
 
 const FARTHEST = 50; // widths of the photo: lines that meet beyond count as parallel
 const NARROWEST = 20; // focal lengths and photo widths differ by no more than this factor
-const RADIANS = Math.PI / 180;
-
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const dot = (a, b) => a.reduce((sum, part, k) => sum + part * b[k], 0);
 
 // Where two segments meet, lengthened; null where they lie on one line.
 export function meeting([one, other], camera) {
