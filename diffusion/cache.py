@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 
 def content_key(*contents: object) -> str:
@@ -29,7 +29,7 @@ def content_key(*contents: object) -> str:
     return digest.hexdigest()
 
 
-def model_key(prior: NetworkPrior) -> str:
+def model_key(prior: StableDiffusion) -> str:
     """Return what tells a model from all others: files, schedule, resolution and arithmetic.
 
     The schedule counts because the same weights stand for another model under another one; version

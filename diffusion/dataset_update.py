@@ -12,7 +12,6 @@ from torch import Tensor
 from warpir.diffusion.crop import Crop, draw_crop
 from warpir.diffusion.draws import generator_of, seed_of
 from warpir.diffusion.gradient_gate import GatedGuidance
-from warpir.diffusion.models.model_error import ModelError
 
 DATASET_UPDATE = "dataset-update"
 """Name of this loss."""
@@ -34,14 +33,10 @@ class DatasetUpdate(GatedGuidance):
 
     Raises:
         ValueError: The mask is empty.
-        ModelError: The prior cannot edit pictures.
     """
 
     def prepare(self) -> None:
         """Embed the prompts that an edit asks for; by then the text encoder may be gone."""
-        if self.prior.editor is None:
-            raise ModelError(self.prior.name, f"cannot edit pictures, as {DATASET_UPDATE} needs")
-        self.editor = self.prior.editor
         self.prior.embed([self.prompt, ""])
         self.crop: Crop | None = None
         self.edited: Tensor | None = None
@@ -65,7 +60,7 @@ class DatasetUpdate(GatedGuidance):
         # The derivative of |x| is a sign, and that of NaN is 0: only the distance tells.
         if not math.isfinite(distance.item()):
             self.edited = None
-            return self.gate.passed(None)
+            return None
         (d_image,) = torch.autograd.grad(distance, leaf)
         return self.gate.passed(d_image)
 
@@ -111,7 +106,7 @@ class DatasetUpdate(GatedGuidance):
         """Return the edited crop, shape [1, 3, R, R]."""
 
         def edited(first: int, last: int) -> Tensor:
-            return self.editor.edit(
+            return self.prior.edit(
                 crop.apply(image, self.prior.resolution).to(self.prior.device),
                 self.prompt,
                 seed_of(*key, "edit"),

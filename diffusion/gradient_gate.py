@@ -6,15 +6,17 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from warpir.diffusion.crop import box_of
-from warpir.diffusion.prior import Counts, Prior
 from warpir.diffusion.schedule import time_range
 from warpir.diffusion.settings import GuidanceSettings
+
+if TYPE_CHECKING:
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 NORM_WINDOW = 101
 """Number of past steps whose median norm defines an outlier."""
@@ -31,36 +33,31 @@ class GradientGate:
 
     def __init__(self, clip: float) -> None:
         self.clip = clip
-        self.counts = Counts()
+        self.clipped_steps = 0
+        """Steps whose gradient was shortened."""
         self.norms: deque[float] = deque(maxlen=NORM_WINDOW)
 
-    def passed(self, d_image: Tensor | None) -> Tensor | None:
-        """Return the gradient, no longer than allowed; None when it is not finite.
-
-        Args:
-            d_image: Any shape; None when it is known not to be finite.
-        """
-        norm = math.nan
-        if d_image is not None:
-            # In float64 the norm is finite exactly when every element is.
-            norm = float(torch.linalg.vector_norm(d_image, dtype=torch.float64))
-        if d_image is None or not math.isfinite(norm):
+    def passed(self, d_image: Tensor) -> Tensor | None:
+        """Return the gradient, no longer than allowed; None when it is not finite."""
+        # In float64 the norm is finite exactly when every element is.
+        norm = float(torch.linalg.vector_norm(d_image, dtype=torch.float64))
+        if not math.isfinite(norm):
             return None
         limit = self.clip * median(self.norms) if len(self.norms) >= NORM_COUNT_MIN else 0.0
         self.norms.append(norm)
         if not 0.0 < limit < norm:
             return d_image
-        self.counts.clipped_steps += 1
+        self.clipped_steps += 1
         return d_image * (limit / norm)
 
     def state_dict(self) -> dict[str, Any]:
         """Return numbers and lists of numbers."""
-        return {"norms": list(self.norms), "clipped_steps": self.counts.clipped_steps}
+        return {"norms": list(self.norms), "clipped_steps": self.clipped_steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from `state_dict`."""
         self.norms = deque(state["norms"], maxlen=NORM_WINDOW)
-        self.counts.clipped_steps = int(state["clipped_steps"])
+        self.clipped_steps = int(state["clipped_steps"])
 
 
 class GatedGuidance:
@@ -81,7 +78,7 @@ class GatedGuidance:
 
     def __init__(
         self,
-        prior: Prior,
+        prior: StableDiffusion,
         prompt: str,
         settings: GuidanceSettings,
         mask: Tensor,
@@ -97,11 +94,6 @@ class GatedGuidance:
 
     def prepare(self) -> None:
         """Compute once what every step needs."""
-
-    @property
-    def counts(self) -> Counts:
-        """What the user is told in the end."""
-        return self.gate.counts
 
     def times(self, step: int) -> tuple[float, float]:
         """Return the least and the greatest time of a step."""

@@ -186,8 +186,7 @@ class Guidance(GatedGuidance):
         """Return whether half precision may have spoilt a gradient and was given up for fp32."""
         if bool(d_image.isfinite().all()) or not bool(image.isfinite().all()):
             return False
-        half = self.prior.half_precision
-        return half is not None and half.upcast()
+        return self.prior.upcast()
 
     def with_loss(self, loss: str) -> Guidance:
         """Return the same guidance with another loss.
@@ -268,7 +267,7 @@ class Guidance(GatedGuidance):
         return torch.tensor([low + (high - low) * u_time])
 
     @torch.no_grad()
-    def ensure_precision(self, image: Tensor) -> float | None:
+    def ensure_precision(self, image: Tensor) -> float:
         """Let the prior compute in full precision if this loss needs it.
 
         Two predictions that nearly cancel keep little of a half-precision network's bits.
@@ -277,14 +276,10 @@ class Guidance(GatedGuidance):
             image: Display-encoded, in [0, 1], shape [1, 3, H, W].
 
         Returns:
-            Cosine between delta as computed before and in full precision; None when the prior has
-            but one.
+            Cosine between delta as computed before and in full precision.
         """
-        half = self.prior.half_precision
-        if half is None:
-            return None
         batches = self._fixed_crops(image, "precision", self.seed, CHECK_COUNT)
-        return half.ensure_precision(
+        return self.prior.ensure_precision(
             lambda: torch.cat([self._delta(crops, self._predictions(crops)) for crops in batches])
         )
 

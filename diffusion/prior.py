@@ -1,20 +1,10 @@
-"""What every diffusion prior promises, and what a picture is judged by.
-
-A prior is a frozen denoiser: it turns pictures into latents, knows its noise schedule, and predicts
-the noise in noisy latents for a prompt, with or without an adapter (a LoRA). Guidance
-(`warpir.diffusion.guidance`) asks nothing else of it.
-"""
+"""What the users of a diffusion prior share: chunks of its work, steps that went wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
-
-import torch
-from torch import Tensor
-
-from warpir.diffusion.schedule import NoiseSchedule
 
 T = TypeVar("T")
 
@@ -66,108 +56,3 @@ class BadSteps:
 
 class NonFiniteError(Exception):
     """Numbers stayed non-finite; the program says so and exits with 6."""
-
-
-class Editor(Protocol):
-    """Changes a picture towards a prompt; an ability that a prior may lack."""
-
-    def edit(
-        self,
-        image: Tensor,
-        prompt: str,
-        seed: int,
-        *,
-        strength: float,
-        steps: int,
-        scale: float,
-        adapter: str | None = None,
-    ) -> Tensor:
-        """Return the picture after noise and denoising (SDEdit), in [0, 1], of the same shape."""
-
-
-class HalfPrecision(Protocol):
-    """Networks that compute in less than full precision, and can be switched over to it."""
-
-    def upcast(self) -> bool:
-        """Compute in fp32 from now on; return False where that is so already."""
-
-    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
-        """Compute in fp32 from now on if a difference of predictions needs it.
-
-        Args:
-            difference: Predicts and subtracts; called twice, with all else equal.
-
-        Returns:
-            Cosine between the difference as computed before and in fp32.
-        """
-
-
-class Prior(Protocol):
-    """A denoiser and its schedule; weights never change, adapters are added beside them."""
-
-    name: str
-    """Such as ``stable-diffusion``; goes into every run's record."""
-    digest: str
-    """sha256 of the weights."""
-    resolution: int
-    """Side of the square pictures it judges [px]."""
-    schedule: NoiseSchedule
-    device: torch.device
-    adapters: set[str]
-    """Names of the LoRAs that were loaded or trained."""
-    in_chunks: InChunks
-    """How its larger batches are computed, such as in halves where memory is short."""
-
-    @property
-    def editor(self) -> Editor | None:
-        """Return what edits pictures, or None."""
-
-    @property
-    def half_precision(self) -> HalfPrecision | None:
-        """Return what switches to full precision, or None where nothing else is computed in."""
-
-    def spare_memory(self) -> None:
-        """Free what only makes it faster."""
-
-    def embed(self, prompts: Sequence[str]) -> Tensor:
-        """Return the prompts' embeddings, shape [prompt, token, channel]; each is computed once.
-
-        Raises:
-            ModelError: The text encoder was freed and a prompt is new.
-        """
-
-    def encode(self, image: Tensor) -> Tensor:
-        """Return latents, float32, shape [B, C, h, w]; differentiable, without sampling noise.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [B, 3, resolution, resolution].
-        """
-
-    def predict(
-        self,
-        latents_noisy: Tensor,
-        t: Tensor,
-        embeddings: Tensor,
-        adapters: Sequence[str | None],
-    ) -> Tensor:
-        """Return the predicted noise (epsilon, whatever the network predicts), float32, detached.
-
-        One batched call; each sample has its own prompt and adapter.
-
-        Args:
-            latents_noisy: ``a z + s noise``, shape [B, C, h, w].
-            t: Times in [0, 1], shape [B].
-            embeddings: From `embed`, one per sample, shape [B, token, channel].
-            adapters: Per sample the name of its adapter, or None for the base weights.
-
-        Raises:
-            ModelError: An adapter is unknown.
-        """
-
-
-@dataclass
-class Counts:
-    """What happened during a run that the user is told about."""
-
-    clipped_steps: int = 0
-    """Steps whose gradient was shortened."""

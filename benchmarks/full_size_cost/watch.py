@@ -12,7 +12,7 @@ import warp as wp
 from benchmarks.measure import peak_mib
 from warpir.app.record import Timings
 from warpir.core.progress import StepProgress
-from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.optimize.light import LightOptimization
 
 

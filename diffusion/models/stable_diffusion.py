@@ -1,67 +1,55 @@
 """Stable Diffusion 2.x (or 1.5) as a prior: autoencoder, UNet and text encoder, all frozen.
 
-Weights and schedule are read by diffusers and transformers from a folder that was checked first.
-The attention processors stay diffusers' own: replacing them loses the care that Stable Diffusion
-2.1 needs in fp16.
+Differences between predictions are tiny beside the predictions, so the UNet computes in fp16 or
+fp32 rather than bf16, and `StableDiffusion.ensure_precision` tells whether fp16 is enough. Each
+sample of a batch has its own prompt and adapter (a LoRA). The attention processors stay diffusers'
+own: replacing them loses the care that Stable Diffusion 2.1 needs in fp16.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any
 
 import torch
-import transformers.utils.logging
-from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+from diffusers import AutoencoderKL, DPMSolverMultistepScheduler, UNet2DConditionModel
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers import CLIPTextModel, CLIPTokenizer
 
-from warpir.diffusion.models.hub import find_model, hub_offline
+from warpir.diffusion.models.adapters import with_adapters
+from warpir.diffusion.models.cuda_graphs import Graphs
 from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.models.model_folder import (
-    LATENT_CHANNELS,
-    ModelFolder,
-    check_model_folder,
-)
-from warpir.diffusion.models.network_prior import DTYPES, NetworkPrior, name_of_dtype
-from warpir.diffusion.prior import InChunks, at_once
-from warpir.diffusion.schedule import NoiseSchedule
-from warpir.diffusion.settings import ModelSettings
+from warpir.diffusion.prior import InChunks, NonFiniteError
+from warpir.diffusion.schedule import TIME_LIMIT, NoiseSchedule
 
-SCHEDULE_WORDS = (
-    "num_train_timesteps",
-    "beta_start",
-    "beta_end",
-    "beta_schedule",
-    "trained_betas",
-    "prediction_type",
-    "rescale_betas_zero_snr",
-    "timestep_spacing",
-    "steps_offset",
-)
-"""What a scheduler's configuration says about the model, and not about a way of sampling it."""
+DTYPES = {"fp16": torch.float16, "bf16": torch.bfloat16, "fp32": torch.float32}
+NAMES = {dtype: name for name, dtype in DTYPES.items()}
+LEAST_COSINE = 0.98
+"""Between a difference in low precision and in fp32; below it, fp16 spoils the guidance."""
 CHECK_TIMES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times at which `StableDiffusion.self_check` measures the prompt's effect."""
 
 
-class StableDiffusion(NetworkPrior):
-    """Stable Diffusion behind `warpir.diffusion.prior.Prior`; made by `load_stable_diffusion`.
+class StableDiffusion:
+    """A frozen denoiser: encodes pictures, and predicts the noise in noisy latents for a prompt.
+
+    Made by `warpir.diffusion.models.loading.load_stable_diffusion`.
 
     Args:
         unet: Predicts noise, v or the clean sample.
         vae: Pictures to latents and back.
         text_encoder: Ids to embeddings, fp32.
         tokenizer: Words to ids.
-        scheduler_config: The model's own; `SCHEDULE_WORDS` of it are used.
+        schedule: Noise schedule of the UNet.
+        solver_config: The same for diffusers' solvers, and what else they have to know.
         file_hashes: sha256 by name of every file that it was made of.
         checkpoint_vae: Recompute the VAE's encoder in the backward pass instead of keeping it.
         graphs: Record what is done often as CUDA graphs; the device must be one.
-        in_chunks: How larger batches are computed.
+        in_chunks: How larger batches are computed, such as in halves where memory is short.
     """
 
     name = "stable-diffusion"
@@ -72,71 +60,96 @@ class StableDiffusion(NetworkPrior):
         vae: AutoencoderKL,
         text_encoder: CLIPTextModel,
         tokenizer: CLIPTokenizer,
-        scheduler_config: dict[str, Any],
-        file_hashes: dict[str, str],
-        checkpoint_vae: bool = True,
-        graphs: bool = False,
-        in_chunks: InChunks = at_once,
+        schedule: NoiseSchedule,
+        solver_config: Mapping[str, Any],
+        file_hashes: Mapping[str, str],
+        checkpoint_vae: bool,
+        graphs: bool,
+        in_chunks: InChunks,
     ) -> None:
-        self.vae, self.tokenizer = vae, tokenizer
-        self.text_encoder: CLIPTextModel | None = text_encoder
-        for model in (vae, text_encoder):
+        for model in (unet, vae, text_encoder):
             model.requires_grad_(False).eval()
-        if checkpoint_vae:
-            self._checkpoint_vae()
-        solver_config = {
-            word: scheduler_config[word] for word in SCHEDULE_WORDS if word in scheduler_config
-        }
+        self.unet, self.vae, self.tokenizer = unet, vae, tokenizer
+        self.text_encoder: CLIPTextModel | None = text_encoder
+        self.schedule, self._solver_config = schedule, dict(solver_config)
+        self.device: torch.device = unet.device
+        self.unet_dtype: torch.dtype = unet.dtype
+        """Arithmetic of the UNet; an adapter in training may have its own."""
         side: int = unet.config.sample_size
-        super().__init__(
-            unet,
-            _noise_schedule(solver_config),
-            solver_config,
-            (LATENT_CHANNELS, side, side),
-            side * 2 ** (len(vae.config.block_out_channels) - 1),
-            file_hashes,
-            graphs,
-            in_chunks,
-        )
+        self.latent_shape = (unet.config.in_channels, side, side)
+        """Shape of one picture's latents, [C, h, w]."""
+        self.resolution = side * 2 ** (len(vae.config.block_out_channels) - 1)
+        """Side of the square pictures that it judges [px]."""
+        self._latent_scale: float = vae.config.scaling_factor
+        self.file_hashes = dict(sorted(file_hashes.items()))
+        lines = "".join(f"{name} {sha256}\n" for name, sha256 in self.file_hashes.items())
+        self.digest = hashlib.sha256(lines.encode()).hexdigest()
+        self.in_chunks = in_chunks
+        self.adapters: set[str] = set()
+        """Whoever adds an adapter to the UNet names it here."""
+        self.notices: tuple[str, ...] = ()
+        """What the user is told about: precision, prompts that are not wholly read."""
+        self._embeddings: dict[str, Tensor] = {}
+        self.graphs = Graphs(self.device) if graphs else None
         self._mean = _PosteriorMean(vae)
         self._recorded_mean = self.graphs.recorded_module(self._mean) if self.graphs else None
-        self._latent_scale: float = vae.config.scaling_factor
-
-    def _checkpoint_vae(self) -> None:
-        # There is no randomness to repeat, and asking for its state would stop a recording.
-        self.vae.enable_gradient_checkpointing(
-            partial(checkpoint, use_reentrant=False, preserve_rng_state=False)
-        )
-        # The encoder recomputes this block as a whole: once is enough.
-        self.vae.encoder.mid_block.gradient_checkpointing = False
-
-    def spare_memory(self) -> None:
-        """Do without recordings, and recompute the VAE's encoder in its backward pass."""
-        super().spare_memory()
-        self._checkpoint_vae()
+        if checkpoint_vae:
+            self._checkpoint_vae()
 
     @property
     def precision(self) -> dict[str, str]:
-        """Arithmetic of UNet and VAE."""
-        return {**super().precision, "vae": name_of_dtype(self.vae.dtype)}
+        """Arithmetic of UNet and VAE, such as ``fp16``."""
+        return {"unet": NAMES[self.unet_dtype], "vae": NAMES[self.vae.dtype]}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a run has changed in it beside adapters: plain values."""
+        return {"precision": self.precision, "notices": self.notices}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from `state_dict`."""
-        super().load_state_dict(state)
+        """Go on from `state_dict`: what had to go over to fp32 computes in it from the start."""
+        if state["precision"]["unet"] == "fp32":
+            self.use_full_precision()
         if state["precision"]["vae"] == "fp32":
-            self._upcast_vae()
+            self.forget_graphs()
+            self.vae.float()
+        self.notices = tuple(dict.fromkeys([*state["notices"], *self.notices]))
 
-    def upcast(self) -> bool:
-        """Let UNet and VAE compute in fp32 from now on; return False where they do already."""
-        is_vae_low = self._upcast_vae()
-        return super().upcast() or is_vae_low
+    def embed(self, prompts: Sequence[str]) -> Tensor:
+        """Return the prompts' embeddings, float32, shape [prompt, token, channel].
 
-    def _upcast_vae(self) -> bool:
-        if self.vae.dtype is torch.float32:
-            return False
-        self.forget_graphs()
-        self.vae.float()
-        return True
+        Each prompt is computed once and kept. One that is too long is cut, with a notice.
+
+        Raises:
+            ModelError: The text encoder was freed and a prompt is new.
+        """
+        for prompt in prompts:
+            if prompt not in self._embeddings:
+                self._embeddings[prompt] = self._encode_text(prompt)
+        return torch.stack([self._embeddings[prompt] for prompt in prompts])
+
+    @torch.no_grad()
+    def _encode_text(self, prompt: str) -> Tensor:
+        """Return a prompt's embedding, float32, shape [token, channel]."""
+        if self.text_encoder is None:
+            what = f"the text encoder was freed before the prompt {prompt!r} was embedded"
+            raise ModelError(self.name, what)
+        length: int = self.text_encoder.config.max_position_embeddings
+        ids = self.tokenizer(prompt, truncation=False, verbose=False).input_ids
+        if len(ids) > length:
+            last = self.tokenizer.decode(ids[length - 7 : length - 1]).strip()
+            self._notice(
+                f"a prompt of {len(ids)} tokens is truncated after {length}: ... {last!r} is the "
+                f"last that is read"
+            )
+        padded = self.tokenizer(
+            prompt,
+            padding="max_length",
+            max_length=length,
+            truncation=True,
+            return_tensors="pt",
+        ).input_ids
+        hidden: Tensor = self.text_encoder(padded.to(self.device))[0]
+        return hidden[0].float()
 
     def free_text_encoder(self) -> None:
         """Drop the text encoder and its memory; embeddings that were made stay."""
@@ -152,15 +165,7 @@ class StableDiffusion(NetworkPrior):
 
         Args:
             image: Display-encoded, in [0, 1], shape [B, 3, resolution, resolution].
-
-        Raises:
-            ValueError: The image has another shape.
         """
-        expected = (3, self.resolution, self.resolution)
-        if image.ndim != 4 or image.shape[1:] != expected:
-            raise ValueError(
-                f"image: shape {tuple(image.shape)} (expected [B, 3, R, R], {expected})"
-            )
         pixels = (2.0 * image - 1.0).to(self.device, self.vae.dtype)
         mean_of: Callable[[Tensor], tuple[Tensor, ...]] = self._mean
         if self.graphs and self._recorded_mean and pixels.requires_grad and torch.is_grad_enabled():
@@ -177,6 +182,105 @@ class StableDiffusion(NetworkPrior):
         scaled = (latents.to(self.device) / self._latent_scale).to(self.vae.dtype)
         images = [self.vae.decode(latent[None]).sample.float() for latent in scaled]
         return (torch.cat(images) / 2.0 + 0.5).clamp(0.0, 1.0)
+
+    def predict(
+        self,
+        latents_noisy: Tensor,
+        t: Tensor,
+        embeddings: Tensor,
+        adapters: Sequence[str | None],
+    ) -> Tensor:
+        """Return the predicted noise (epsilon, whatever the network predicts), float32, detached.
+
+        One batched call; each sample has its own prompt and adapter.
+
+        Args:
+            latents_noisy: ``a z + s noise``, shape [B, C, h, w].
+            t: Times in [0, 1], shape [B].
+            embeddings: From `embed`, one per sample, shape [B, token, channel].
+            adapters: Per sample the name of its adapter, or None for the base weights.
+
+        Raises:
+            ModelError: An adapter is unknown.
+        """
+        self._check_adapters(adapters)
+        latents_noisy, t = latents_noisy.detach().to(self.device), t.to(self.device)
+        timesteps = self.schedule.timestep(t)
+        predicted = self._denoise(latents_noisy, timesteps, embeddings, tuple(adapters))
+        return self.schedule.to_noise(predicted, latents_noisy, t)
+
+    def sample(
+        self,
+        prompts: Sequence[str],
+        seeds: Sequence[int],
+        *,
+        steps: int,
+        scale: float,
+        adapter: str | None = None,
+        batch: int = 8,
+    ) -> Tensor:
+        """Return pictures of the prompts, in [0, 1], shape [prompt, 3, resolution, resolution].
+
+        DPM-Solver++ of second order (arXiv 2211.01095). A picture depends on its own prompt and
+        seed, that of its first noise, not on those made with it, ``batch`` at once. ``scale`` is
+        that of classifier-free guidance over the empty prompt; 1: none. Without an adapter the base
+        weights are used.
+
+        Raises:
+            ModelError: The adapter is unknown, or the text encoder was freed.
+        """
+        self._check_adapters([adapter])
+        wanted, null = self.embed(prompts), self.embed([""])
+        images: list[Tensor] = []
+        for start in range(0, len(prompts), batch):
+
+            def made(first: int, last: int, start: int = start) -> Tensor:
+                these = slice(start + first, start + last)
+                solver = DPMSolverMultistepScheduler.from_config(
+                    self._solver_config, solver_order=2
+                )
+                solver.set_timesteps(steps)
+                noise = self._noise(seeds[these])
+                return self.decode(self._solve(solver, noise, wanted[these], null, scale, adapter))
+
+            count = min(batch, len(prompts) - start)
+            images += self.in_chunks(
+                made, count, "pictures of the class", "--class-batch", self.spare_memory
+            )
+        return torch.cat(images)
+
+    def edit(
+        self,
+        image: Tensor,
+        prompt: str,
+        seed: int,
+        *,
+        strength: float,
+        steps: int,
+        scale: float,
+        adapter: str | None = None,
+    ) -> Tensor:
+        """Return a picture that was noised and denoised again (SDEdit, arXiv 2108.01073).
+
+        DDIM, which is DPM-Solver++ of first order, with all its steps below ``strength``, the time
+        in [0, 1] that it is noised to; 0: only through the VAE and back. Prompt, scale, adapter
+        and errors are as of `sample`.
+
+        Picture and edit are display-encoded, in [0, 1], shape [1, 3, resolution, resolution].
+        """
+        self._check_adapters([adapter])
+        wanted, null = self.embed([prompt]), self.embed([""])
+        with torch.no_grad():
+            latents = self.encode(image)
+        t = torch.tensor([min(strength, TIME_LIMIT)])
+        start = int(self.schedule.timestep(t))
+        if start > 0:
+            solver = DPMSolverMultistepScheduler.from_config(self._solver_config, solver_order=1)
+            times = torch.linspace(start, 0, steps + 1)[:-1].round().long().tolist()
+            solver.set_timesteps(timesteps=sorted(set(times), reverse=True))
+            noisy = self.schedule.add_noise(latents, self._noise([seed]), t.to(self.device))
+            latents = self._solve(solver, noisy, wanted, null, scale, adapter)
+        return self.decode(latents)
 
     @torch.no_grad()
     def self_check(self, image: Tensor, prompt: str, seed: int = 0) -> dict[str, float]:
@@ -209,34 +313,181 @@ class StableDiffusion(NetworkPrior):
             return both[:count] - both[count:]
 
         half = torch.tensor([0.5], device=self.device)
-        figures = {"noise_error": float((noise_at(half, pair[:1]) - noise).square().mean())}
         sizes = difference().square().mean(dim=(1, 2, 3)).sqrt().tolist()
-        figures |= {f"difference_{t}": s for t, s in zip(CHECK_TIMES, sizes, strict=True)}
-        return figures | {"precision": self.precision_check(difference)}
+        return {
+            "noise_error": float((noise_at(half, pair[:1]) - noise).square().mean()),
+            **{f"difference_{t}": size for t, size in zip(CHECK_TIMES, sizes, strict=True)},
+            "precision": self.precision_check(difference),
+        }
+
+    def precision_check(self, difference: Callable[[], Tensor]) -> float:
+        """Return the cosine between a difference of predictions as computed here and in fp32.
+
+        Args:
+            difference: Predicts and subtracts, such as guidance does with its own prompts and
+                adapters; called twice, with all else equal. 1 where the UNet is in fp32 anyway.
+        """
+        if self.unet_dtype is torch.float32:
+            return 1.0
+        low = difference().double().flatten()
+        with self.in_full_precision():
+            full = difference().double().flatten()
+        return float(torch.dot(low, full) / (low.norm() * full.norm()))
+
+    def ensure_precision(self, difference: Callable[[], Tensor]) -> float:
+        """Go on in fp32 if the difference needs it, with a notice; return `precision_check`.
+
+        To be called before anything that holds on to the UNet's weights.
+        """
+        cosine = self.precision_check(difference)
+        if not cosine >= LEAST_COSINE:  # nan, where half precision overflowed, counts as too small
+            self._notice(
+                f"the UNet computes in fp32: in {self.precision['unet']} the guidance has cosine "
+                f"{cosine:.3f} with the exact one (at least {LEAST_COSINE})"
+            )
+            self.use_full_precision()
+        return cosine
+
+    def use_full_precision(self) -> None:
+        """Let the UNet compute in fp32 from now on; its weights stay as rounded as they were."""
+        self.forget_graphs()
+        for weight in self.unet.parameters():
+            weight.data = weight.data.float()
+        self.unet_dtype = torch.float32
+
+    def upcast(self) -> bool:
+        """Let UNet and VAE compute in fp32 from now on; return False where they do already."""
+        before = self.precision
+        self.use_full_precision()
+        self.vae.float()
+        return self.precision != before
+
+    def finite(self, compute: Callable[[], Tensor], what: str) -> Tensor:
+        """Return what is computed; in fp32 and from now on so, where half precision overflows.
+
+        Args:
+            compute: Called again in fp32.
+            what: What it computes, for a person.
+
+        Raises:
+            NonFiniteError: It is not finite in fp32 either.
+        """
+        computed = compute()
+        if not bool(computed.isfinite().all()) and self.upcast():
+            self._notice(f"the model computes in fp32: {what} were not finite before")
+            computed = compute()
+        if not bool(computed.isfinite().all()):
+            raise NonFiniteError(f"{what} are not finite (found nan or inf), in fp32 too")
+        return computed
+
+    def spare_memory(self) -> None:
+        """Do without recordings, and recompute the VAE's encoder in its backward pass."""
+        self.forget_graphs()
+        self.graphs = None
+        self._checkpoint_vae()
+
+    def _checkpoint_vae(self) -> None:
+        # There is no randomness to repeat, and asking for its state would stop a recording.
+        self.vae.enable_gradient_checkpointing(
+            partial(checkpoint, use_reentrant=False, preserve_rng_state=False)
+        )
+        # The encoder recomputes this block as a whole: once is enough.
+        self.vae.encoder.mid_block.gradient_checkpointing = False
+
+    @contextmanager
+    def in_full_precision(self) -> Iterator[None]:
+        """Let the UNet compute in fp32 within this context, then as before on the same memory."""
+        used, values = self.unet_dtype, [(w, w.data) for w in self.unet.parameters()]
+        graphs, self.graphs = self.graphs, None  # recordings read this memory, and will again
+        self.use_full_precision()
+        try:
+            yield
+        finally:
+            for weight, value in values:
+                weight.data = value
+            self.unet_dtype, self.graphs = used, graphs
+
+    def forget_graphs(self) -> None:
+        """Free what was recorded: to be called before weights or adapters change."""
+        if self.graphs is not None:
+            self.graphs.clear()
+
+    def denoise(self, latents_noisy: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
+        """Return what the UNet predicts with the adapters that are switched on; differentiable.
+
+        Latents are on the device, shape [B, C, h, w]; timesteps int64, shape [B]; embeddings of
+        shape [B, token, channel].
+        """
+        predicted: Tensor = self.unet(
+            latents_noisy, timesteps, encoder_hidden_states=embeddings
+        ).sample
+        return predicted
 
     @torch.no_grad()
-    def _encode_text(self, prompt: str) -> Tensor:
-        """Return a prompt's embedding, float32, shape [token, channel]."""
-        if self.text_encoder is None:
-            what = f"the text encoder was freed before the prompt {prompt!r} was embedded"
-            raise ModelError(self.name, what)
-        length: int = self.text_encoder.config.max_position_embeddings
-        ids = self.tokenizer(prompt, truncation=False, verbose=False).input_ids
-        if len(ids) > length:
-            last = self.tokenizer.decode(ids[length - 7 : length - 1]).strip()
-            self._notice(
-                f"a prompt of {len(ids)} tokens is truncated after {length}: ... {last!r} is the "
-                f"last that is read"
+    def _denoise(
+        self,
+        latents: Tensor,
+        timesteps: Tensor,
+        embeddings: Tensor,
+        adapters: tuple[str | None, ...],
+    ) -> Tensor:
+        """Return what the UNet predicts with each sample's adapter or None, float32, detached."""
+        kind = self.unet_dtype
+
+        def unet(latents: Tensor, timesteps: Tensor, embeddings: Tensor) -> Tensor:
+            exact = no_tf32() if kind is torch.float32 else nullcontext()
+            with with_adapters(self.unet, adapters), exact:
+                return self.denoise(latents.to(kind), timesteps, embeddings.to(kind)).float()
+
+        arguments = [x.to(self.device) for x in (latents, timesteps, embeddings)]
+        if self.graphs is None:
+            return unet(*arguments)
+        return self.graphs.run((kind, adapters), unet, *arguments)
+
+    def _check_adapters(self, names: Sequence[str | None]) -> None:
+        unknown = {name for name in names if name is not None} - self.adapters
+        if unknown:
+            known = ", ".join(sorted(self.adapters)) or "none"
+            raise ModelError(self.name, f"no adapter {min(unknown)!r} (there are: {known})")
+
+    def _noise(self, seeds: Sequence[int]) -> Tensor:
+        """Return one noise per seed, shape [seed, C, h, w]; drawn on the CPU, alike everywhere."""
+        shape = self.latent_shape
+        draws = [torch.randn(shape, generator=torch.Generator().manual_seed(s)) for s in seeds]
+        return torch.stack(draws).to(self.device)
+
+    def _solve(
+        self,
+        solver: DPMSolverMultistepScheduler,
+        latents: Tensor,
+        wanted: Tensor,
+        null: Tensor,
+        scale: float,
+        adapter: str | None,
+    ) -> Tensor:
+        """Denoise latents through the solver's timesteps, with classifier-free guidance.
+
+        Latents, shape [B, 4, h, w], are those of the first timestep. Embeddings are what is wanted,
+        shape [B, token, channel], and that of the null prompt, shape [1, token, channel].
+        """
+        count = len(latents)
+        embeddings = wanted if scale == 1.0 else torch.cat([wanted, null.expand_as(wanted)])
+        repeats = len(embeddings) // count
+        for timestep in solver.timesteps:
+            predicted = self._denoise(
+                latents.repeat(repeats, 1, 1, 1),
+                timestep.expand(repeats * count),
+                embeddings,
+                (adapter,) * (repeats * count),
             )
-        padded = self.tokenizer(
-            prompt,
-            padding="max_length",
-            max_length=length,
-            truncation=True,
-            return_tensors="pt",
-        ).input_ids
-        hidden: Tensor = self.text_encoder(padded.to(self.device))[0]
-        return hidden[0].float()
+            if repeats == 2:
+                prompted, unprompted = predicted.chunk(2)
+                predicted = unprompted + scale * (prompted - unprompted)
+            latents = solver.step(predicted, timestep, latents).prev_sample
+        return latents
+
+    def _notice(self, text: str) -> None:
+        self.notices = (*self.notices, text)
 
 
 class _PosteriorMean(nn.Module):
@@ -250,152 +501,12 @@ class _PosteriorMean(nn.Module):
         return (self.vae.encode(pixels).latent_dist.mean,)
 
 
-def load_stable_diffusion(
-    settings: ModelSettings, device: torch.device | str, in_chunks: InChunks = at_once
-) -> StableDiffusion:
-    """Load a model from a folder, or from a hub id in the local cache.
-
-    UNet, VAE and text encoder go to ``device``; on the CPU all is computed in fp32. ``in_chunks``
-    says how larger batches are computed.
-
-    Raises:
-        ModelError: The model is not there, is another one or is damaged; one sentence says how.
-        ValueError: A precision is unknown.
-    """
-    device = torch.device(device)
-    asked = settings.precision, settings.vae_precision
-    for name in asked:
-        if name not in DTYPES:
-            raise ValueError(f"precision: {', '.join(DTYPES)} (found {name!r})")
-    unet_precision, vae_precision = ("fp32", "fp32") if device.type == "cpu" else asked
-
-    with hub_offline(not settings.allow_download), ThreadPoolExecutor() as pool:
-        found = find_model(settings.model, settings.allow_download, settings.allow_pickle)
-        folder = check_model_folder(found, settings.allow_pickle)
-        # Hashing reads what loading reads, at the same time.
-        hashes = pool.map(folder.file_hash, folder.files)
-        unet = _load(UNet2DConditionModel, folder, "unet", unet_precision, device)
-        vae = _load(AutoencoderKL, folder, "vae", vae_precision, device)
-        # The attention is named lest the configuration name code of the hub.
-        options = {
-            "attn_implementation": "sdpa",
-            "trust_remote_code": False,
-            "weights_only": True,  # diffusers reads no other pickles
-        }
-        text_encoder = _load(CLIPTextModel, folder, "text_encoder", "fp32", device, **options)
-        tokenizer = _load_tokenizer(folder, text_encoder.config.vocab_size)
-        prior = StableDiffusion(
-            unet,
-            vae,
-            text_encoder,
-            tokenizer,
-            folder.configs["scheduler"],
-            dict(hashes),
-            settings.vae_checkpointing,
-            settings.graphs and device.type == "cuda",
-            in_chunks,
-        )
-    if asked != (unet_precision, vae_precision):
-        prior.notices += (f"the CPU computes in fp32 (asked for: {', '.join(sorted(set(asked)))})",)
-    pickles = [part for part, held in folder.weights.items() if held.is_pickle]
-    if pickles:
-        prior.notices += (f"weights read from pickles: {', '.join(pickles)} (--allow-pickle)",)
-    return prior
-
-
-def _load(
-    kind: Any,
-    folder: ModelFolder,
-    part: str,
-    precision: str,
-    device: torch.device,
-    **options: Any,
-) -> Any:
-    """Load one part's network, with exactly the weights it needs, all of them finite.
-
-    Raises:
-        ModelError: The weights are not the network's, or not finite in this precision.
-    """
-    path, weights = folder.path / part, folder.weights[part]
-    with _one_sentence(str(path)):
-        network, loaded = kind.from_pretrained(
-            path,
-            dtype=DTYPES[precision],
-            variant=weights.variant,
-            use_safetensors=not weights.is_pickle,
-            local_files_only=True,
-            output_loading_info=True,
-            **options,
-        )
-    for word, what in (("missing_keys", "lacks"), ("unexpected_keys", "has foreign")):
-        if loaded[word]:
-            names = sorted(loaded[word])
-            raise ModelError(str(path), f"{what} weights ({len(names)}, such as {names[0]})")
-    network = network.to(device)
-    for name, weight in network.named_parameters():
-        if not bool(torch.isfinite(weight).all()):
-            raise ModelError(str(path), f"{name} is not finite in {precision}")
-    return network
-
-
-def _load_tokenizer(folder: ModelFolder, vocabulary: int) -> CLIPTokenizer:
-    """Load the tokenizer.
-
-    Raises:
-        ModelError: It cannot be read, or has ids that the text encoder has not.
-    """
-    path = folder.path / "tokenizer"
-    with _one_sentence(str(path)):
-        tokenizer = CLIPTokenizer.from_pretrained(
-            path, local_files_only=True, trust_remote_code=False
-        )
-        count = len(tokenizer)
-    if count > vocabulary:
-        raise ModelError(str(path), f"{count} tokens (expected {vocabulary}, the text encoder's)")
-    return tokenizer
-
-
-def _noise_schedule(config: dict[str, Any]) -> NoiseSchedule:
-    """Return the schedule of a scheduler's configuration, as diffusers computes it.
-
-    Raises:
-        ModelError: It is none of the kinds that Stable Diffusion has.
-    """
-    where = "scheduler/scheduler_config.json"
-    kind = config.get("prediction_type", "epsilon")
-    count = config.get("num_train_timesteps", 1000)
-    with _one_sentence(where):
-        scheduler = DDIMScheduler.from_config(config)
-        betas: Tensor = scheduler.betas
-    if len(betas) != count or not bool(((betas > 0.0) & (betas <= 1.0)).all()):
-        raise ModelError(where, f"no noise schedule (expected {count} betas between 0 and 1)")
-    return NoiseSchedule(scheduler.alphas_cumprod.double(), kind)
-
-
 @contextmanager
-def _one_sentence(where: str) -> Iterator[None]:
-    """Turn whatever a library raises about a file into one `ModelError`, and hush its log.
-
-    Raises:
-        ModelError: Something was raised that is no lack of memory.
-    """
-    logs = [logging.getLogger(name) for name in ("diffusers", "transformers")]
-    levels = [log.level for log in logs]
-    for log in logs:
-        log.setLevel(logging.CRITICAL)
-    bars = transformers.utils.logging.is_progress_bar_enabled()
-    transformers.utils.logging.disable_progress_bar()
+def no_tf32() -> Iterator[None]:
+    """Keep cuDNN from rounding fp32 to TF32, which has no more bits than fp16."""
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
     try:
         yield
-    except Exception as error:  # diffusers, transformers and tokenizers raise anything
-        short = ("allocate mem", "out of memory", "Cannot allocate")
-        if isinstance(error, MemoryError) or any(words in str(error) for words in short):
-            raise
-        reason = " ".join(str(error).split())[:160]
-        what = f"cannot be loaded ({type(error).__name__}: {reason})"
-        raise ModelError(where, what, "fetch the model again") from error
     finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.setLevel(level)
-        if bars:
-            transformers.utils.logging.enable_progress_bar()
+        torch.backends.cudnn.allow_tf32 = before

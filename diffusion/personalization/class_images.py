@@ -30,7 +30,7 @@ from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 FORMAT = 1
 """Meaning of a stored picture; part of every key."""
@@ -63,7 +63,7 @@ def class_image_count(settings: PersonalizeSettings) -> int:
 
 
 def make_class_images(
-    prior: NetworkPrior,
+    prior: StableDiffusion,
     prompts: Prompts,
     settings: PersonalizeSettings,
     seed: int,
@@ -118,7 +118,10 @@ def make_class_images(
 
 
 def _made(
-    prior: NetworkPrior, texts: Sequence[str], seeds: Sequence[int], settings: PersonalizeSettings
+    prior: StableDiffusion,
+    texts: Sequence[str],
+    seeds: Sequence[int],
+    settings: PersonalizeSettings,
 ) -> Tensor:
     """Return one batch of pictures by the unadapted model, uint8, shape [B, 3, R, R]."""
 
@@ -154,7 +157,7 @@ def to_bytes(pictures: Tensor) -> Tensor:
 
 
 def encode_pictures(
-    prior: NetworkPrior, pictures: Tensor, batch: int, report: Report | None = None
+    prior: StableDiffusion, pictures: Tensor, batch: int, report: Report | None = None
 ) -> Tensor:
     """Return the pictures' latents, float32 on the CPU, shape [N, C, h, w].
 

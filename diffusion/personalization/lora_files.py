@@ -36,7 +36,7 @@ from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.models.weight_files import beside_lora, check_lora, not_a_lora
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""
@@ -83,7 +83,7 @@ def _commonest(values: Iterable[float]) -> float:
     return Counter(values).most_common(1)[0][0]
 
 
-def initial_lora(prior: NetworkPrior, layers: tuple[str, ...], rank: int, seed: int) -> Lora:
+def initial_lora(prior: StableDiffusion, layers: tuple[str, ...], rank: int, seed: int) -> Lora:
     """Return a LoRA that changes nothing yet: A is Gaussian of deviation 1/rank, B is zero.
 
     Layers are ends of the names of the UNet's layers, such as ``to_q``; alpha is the rank.
@@ -258,7 +258,7 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
 # Putting a LoRA beside a model's weights
 
 
-def load_lora(prior: NetworkPrior, path: str | Path, name: str = "scene") -> Lora:
+def load_lora(prior: StableDiffusion, path: str | Path, name: str = "scene") -> Lora:
     """Read a LoRA file and put it beside the prior's weights under a name.
 
     Raises:
@@ -269,7 +269,7 @@ def load_lora(prior: NetworkPrior, path: str | Path, name: str = "scene") -> Lor
     return lora
 
 
-def install_lora(prior: NetworkPrior, lora: Lora, name: str, where: str = "LoRA") -> None:
+def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "LoRA") -> None:
     """Put a LoRA beside the UNet's weights, in place of one of the same name.
 
     It is frozen and has the UNet's precision. The prior's ``adapters`` get its name; an error names
@@ -322,7 +322,7 @@ def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
         raise ModelError(where, f"not whole (found {found}; missing {absent[0]})")
 
 
-def remove_lora(prior: NetworkPrior, name: str) -> None:
+def remove_lora(prior: StableDiffusion, name: str) -> None:
     """Take an adapter away; nothing happens when there is none of that name."""
     prior.forget_graphs()
     if name in getattr(prior.unet, "peft_config", {}):
@@ -339,7 +339,7 @@ def _without_warnings() -> Iterator[None]:
         yield
 
 
-def lora_parameters(prior: NetworkPrior, name: str) -> dict[str, nn.Parameter]:
+def lora_parameters(prior: StableDiffusion, name: str) -> dict[str, nn.Parameter]:
     """Return an adapter's parameters under the names that `Lora` gives its weights, sorted."""
     from peft.tuners.lora.layer import LoraLayer
 
@@ -352,7 +352,7 @@ def lora_parameters(prior: NetworkPrior, name: str) -> dict[str, nn.Parameter]:
 
 
 def put_weights(
-    prior: NetworkPrior, name: str, weights: Mapping[str, Tensor], dtype: torch.dtype
+    prior: StableDiffusion, name: str, weights: Mapping[str, Tensor], dtype: torch.dtype
 ) -> None:
     """Give an adapter's parameters values and a precision."""
     prior.forget_graphs()

@@ -23,7 +23,7 @@ from warpir.diffusion.prior import BAD_STEPS_MAX, BadSteps, NonFiniteError
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 BETAS = (0.9, 0.999)
 """Of AdamW; as in diffusers' example of DreamBooth with a LoRA."""
@@ -50,7 +50,7 @@ class LoraTraining:
 
     def __init__(
         self,
-        prior: NetworkPrior,
+        prior: StableDiffusion,
         lora: Lora,
         photo: Tensor,
         classes: Tensor,

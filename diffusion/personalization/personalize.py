@@ -45,7 +45,7 @@ from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
@@ -94,7 +94,7 @@ class Personalization:
         }
 
 
-def restore_personalization(prior: NetworkPrior, state: Mapping[str, Any]) -> Personalization:
+def restore_personalization(prior: StableDiffusion, state: Mapping[str, Any]) -> Personalization:
     """Adapt the prior as `Personalization.state_dict` says; neither a file nor a cache is asked.
 
     Raises:
@@ -116,7 +116,7 @@ def restore_personalization(prior: NetworkPrior, state: Mapping[str, Any]) -> Pe
 
 
 def personalize(
-    prior: NetworkPrior,
+    prior: StableDiffusion,
     photo: Tensor,
     prompts: Prompts,
     settings: PersonalizeSettings,
@@ -275,7 +275,7 @@ def photo_crops(size: tuple[int, int], settings: PersonalizeSettings, seed: int)
 
 
 def photo_latents(
-    prior: NetworkPrior, photo: Tensor, settings: PersonalizeSettings, seed: int
+    prior: StableDiffusion, photo: Tensor, settings: PersonalizeSettings, seed: int
 ) -> Tensor:
     """Return the latents of `photo_crops`, float32 on the CPU, shape [crop, C, h, w]."""
     height, width = photo.shape[-2:]
@@ -291,7 +291,7 @@ def photo_latents(
 
 
 def evaluate(
-    prior: NetworkPrior, crops: Tensor, embedding: Tensor, seed: int, adapter: str | None
+    prior: StableDiffusion, crops: Tensor, embedding: Tensor, seed: int, adapter: str | None
 ) -> float:
     """Return the mean squared error of the noise on fixed draws from the photo.
 
@@ -320,7 +320,7 @@ def evaluate(
 
 
 def lora_key(
-    prior: NetworkPrior,
+    prior: StableDiffusion,
     photo: Tensor,
     prompts: Prompts,
     settings: PersonalizeSettings,

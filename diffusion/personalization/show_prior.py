@@ -22,7 +22,7 @@ from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
 
 if TYPE_CHECKING:
-    from warpir.diffusion.models.network_prior import NetworkPrior
+    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 # Neither is part of the other: diffusers would look for the one among the weights of the other.
 WITH_CLASS, WITHOUT_CLASS = "scene", "no-class"
@@ -39,7 +39,7 @@ LABEL_WIDTH = 180
 
 
 def show_prior(
-    prior: NetworkPrior,
+    prior: StableDiffusion,
     prompts: Sequence[str],
     adapters: Sequence[str | None],
     seeds: Sequence[int],
@@ -80,7 +80,7 @@ def show_prior(
 
 
 def show_personalization(
-    prior: NetworkPrior,
+    prior: StableDiffusion,
     photo: Tensor,
     prompts: Prompts,
     settings: PersonalizeSettings,

@@ -28,7 +28,8 @@ from warpir.core import memory as memory_module
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import SHORT, Memory, Need, free_host, is_shortage, lacked_memory
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.models.loading import load_stable_diffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.class_images import make_class_images
 from warpir.diffusion.personalization.lora_files import initial_lora
 from warpir.diffusion.personalization.lora_training import LoraTraining

@@ -15,8 +15,8 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core.atomic import write_file
 from warpir.core.cache import make_room
 from warpir.diffusion.cache import content_key, model_key
-from warpir.diffusion.models.network_prior import NetworkPrior
-from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.models.loading import load_stable_diffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.class_images import (
     class_image_count,
     encode_pictures,
@@ -53,7 +53,7 @@ class Painter:
     device = torch.device("cpu")
     schedule = NoiseSchedule(torch.linspace(0.99, 0.01, 10, dtype=torch.float64), "epsilon")
 
-    finite = NetworkPrior.finite
+    finite = StableDiffusion.finite
 
     def upcast(self) -> bool:
         return False

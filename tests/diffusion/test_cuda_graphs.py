@@ -20,7 +20,8 @@ from tests.builders.loops import TRACED, Pull, a_frame, bent
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.models.cuda_graphs import PLAIN_CALLS, Graphs
-from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.models.loading import load_stable_diffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.lora_files import (
     initial_lora,
     install_lora,

@@ -24,13 +24,13 @@ from tests.builders.faults import NO_TORCH, assert_fails
 from tests.builders.insertions import arguments
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.diffusion.models.hub import find_model, hub_offline, needed_files
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import (
     JSON_LIMIT,
     check_model_folder,
     choose_weights,
 )
-from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
 from warpir.diffusion.settings import ModelSettings
 
 UNET = "unet/diffusion_pytorch_model.safetensors"

@@ -17,9 +17,9 @@ from torch import Tensor
 import warpir.diffusion.personalization.personalize as module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core.cache import take_notices
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
-from warpir.diffusion.models.network_prior import NetworkPrior
-from warpir.diffusion.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.models.tensor_files import serialize
 from warpir.diffusion.personalization.lora_files import (
     Lora,
@@ -151,7 +151,7 @@ def test_evaluation_is_the_error_of_the_noise(prior: StableDiffusion) -> None:
 
     class Silent:
         schedule = prior.schedule
-        finite = NetworkPrior.finite
+        finite = StableDiffusion.finite
 
         def predict(self, noisy: Tensor, t: Tensor, *rest: object) -> Tensor:
             times.append(t)

@@ -15,11 +15,11 @@ from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.check_model import main
 from warpir.core.errors import ExitCode
-from warpir.diffusion.models.network_prior import LEAST_COSINE
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.stable_diffusion import (
     CHECK_TIMES,
+    LEAST_COSINE,
     StableDiffusion,
-    load_stable_diffusion,
 )
 from warpir.diffusion.settings import ModelSettings
 from warpir.optimize import model_check

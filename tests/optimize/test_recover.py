@@ -249,7 +249,9 @@ def test_resume_stands_on_its_checkpoint_alone(
     monkeypatch.setattr(
         "warpir.diffusion.personalization.lora_training.LoraTraining.update", pytest.fail
     )
-    monkeypatch.setattr("warpir.diffusion.models.network_prior.NetworkPrior.sample", pytest.fail)
+    monkeypatch.setattr(
+        "warpir.diffusion.models.stable_diffusion.StableDiffusion.sample", pytest.fail
+    )
     assert main([*argv(folder, unfinished), "--resume"]) == ExitCode.DONE
     assert results(unfinished) == results(finished)
 

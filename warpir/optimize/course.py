@@ -87,7 +87,7 @@ class Course:
     def record(self, integrator: str) -> dict[str, Any]:
         """Return the entries of ``run.json`` about model, loop and its integrator."""
         counts = {
-            "clipped_steps": self.guide.counts.clipped_steps,
+            "clipped_steps": self.guide.gate.clipped_steps,
             "bad_pixels": self.renderer.bad_pixels.count,
         }
         return {

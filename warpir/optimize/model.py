@@ -20,10 +20,10 @@ from warpir.core.memory import needs_of_model
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance, kind_of
 from warpir.diffusion.models.hub import find_model, hub_offline
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import check_model_folder
-from warpir.diffusion.models.network_prior import NetworkPrior
-from warpir.diffusion.models.stable_diffusion import load_stable_diffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.personalize import (
     Personalization,
     personalize,
@@ -46,7 +46,7 @@ LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 class Asked:
     """A model and its prompts."""
 
-    prior: NetworkPrior
+    prior: StableDiffusion
     prompts: Prompts
 
 
@@ -63,7 +63,7 @@ class Guided:
     """Checkpoint to resume from, if there is one."""
 
     @property
-    def prior(self) -> NetworkPrior:
+    def prior(self) -> StableDiffusion:
         """The model."""
         return self.asked.prior
 
@@ -151,7 +151,7 @@ def require_memory(run: Run) -> None:
     run.memory.require(*needs_of_model(size, side, pictures, is_half=is_half))
 
 
-def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: NetworkPrior) -> Checkpoint | None:
+def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: StableDiffusion) -> Checkpoint | None:
     """Return the checkpoint to resume from, written with this model; None where there is none.
 
     Raises:

@@ -25,11 +25,11 @@ from warpir.core.errors import disk_error
 from warpir.core.strict_json import json_bytes
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.guidance import Guidance
-from warpir.diffusion.models.network_prior import LEAST_COSINE
+from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.stable_diffusion import (
     CHECK_TIMES,
+    LEAST_COSINE,
     StableDiffusion,
-    load_stable_diffusion,
 )
 from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.personalization.personalize import personalize
