@@ -65,22 +65,18 @@ class DatasetUpdate(GatedGuidance):
         return self.gate.passed(d_image)
 
     @torch.no_grad()
-    def score(
-        self, image: Tensor, seed: int | None = None, edits: int = EDIT_COUNT
-    ) -> float | None:
+    def score(self, image: Tensor) -> float | None:
         """Return how much the model would change an image; None when that is not finite.
 
-        The mean distance between so many crops and their edits, all of the run's greatest strength.
-        The image is display-encoded, in [0, 1], shape [1, 3, H, W]; the seed is the guidance's own
-        by default.
+        The mean distance between `EDIT_COUNT` crops and their edits, all of the run's greatest
+        strength. The image is display-encoded, in [0, 1], shape [1, 3, H, W].
         """
-        seed = self.seed if seed is None else seed
         distances = []
-        for k in range(edits):
-            crop = self._draw(image, seed, "score", k)
-            edited = self._edit(image, crop, self.settings.time_max, seed, "score", k)
+        for k in range(EDIT_COUNT):
+            crop = self._draw(image, self.seed, "score", k)
+            edited = self._edit(image, crop, self.settings.time_max, self.seed, "score", k)
             distances.append(self._distance(image, crop, edited).item())
-        score = sum(distances) / edits
+        score = sum(distances) / EDIT_COUNT
         return score if math.isfinite(score) else None
 
     def state_dict(self) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class Coefficients:
     """Null and negative terms have the adapter too."""
 
 
-def coefficients(settings: GuidanceSettings, has_adapter: bool = False) -> Coefficients:
+def coefficients(settings: GuidanceSettings, has_adapter: bool) -> Coefficients:
     """Return the row of a loss (DiPIR, eq. 7 and 8, figure S3; CSD: arXiv 2310.19415).
 
     Args:
@@ -88,25 +88,6 @@ class Term:
     adapter: str | None
 
 
-def terms_of(settings: GuidanceSettings, prompt: str, adapter: str | None) -> list[Term]:
-    """Return the terms of a loss that count, those whose coefficient is not 0.
-
-    Raises:
-        ValueError: The loss is unknown, or its adapter is missing.
-    """
-    row = coefficients(settings, adapter is not None)
-    if adapter is None and (row.k_p or row.null_adapter):
-        raise ValueError(f"loss: {settings.loss} needs an adapter; csd and sds-base do without")
-    other = adapter if row.null_adapter else None
-    terms = [
-        Term(row.k_p, prompt, adapter),
-        Term(row.k_c, settings.base_prompt or prompt, None),
-        Term(row.k_0, settings.null_prompt, other),
-        Term(row.k_n, settings.negative_prompt, other),
-    ]
-    return [term for term in terms if term.scale]
-
-
 @dataclass(frozen=True)
 class NoisyCrops:
     """Crops of a picture, as the prior sees them at some times."""
@@ -138,9 +119,19 @@ class Guidance(GatedGuidance):
     """
 
     def prepare(self) -> None:
-        """Embed the prompts of the terms that count."""
-        self.row = coefficients(self.settings, self.adapter is not None)
-        self.terms = terms_of(self.settings, self.prompt, self.adapter)
+        """Embed the prompts of the terms that count, those whose coefficient is not 0."""
+        s, adapter = self.settings, self.adapter
+        self.row = row = coefficients(s, adapter is not None)
+        if adapter is None and (row.k_p or row.null_adapter):
+            raise ValueError(f"loss: {s.loss} needs an adapter; csd and sds-base do without")
+        other = adapter if row.null_adapter else None
+        terms = (
+            Term(row.k_p, self.prompt, adapter),
+            Term(row.k_c, s.base_prompt or self.prompt, None),
+            Term(row.k_0, s.null_prompt, other),
+            Term(row.k_n, s.negative_prompt, other),
+        )
+        self.terms = [term for term in terms if term.scale]
         self.embeddings = self.prior.embed([term.prompt for term in self.terms])
 
     def gradient(self, image: Tensor, step: int) -> Tensor | None:

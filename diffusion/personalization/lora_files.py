@@ -19,8 +19,7 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -280,7 +279,7 @@ def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "Lo
     """
     check_fit(prior.unet, lora, where)
     remove_lora(prior, name)
-    with _without_warnings():
+    with warnings.catch_warnings(action="ignore"):  # several adapters are meant
         prior.unet.load_lora_adapter(
             dict(lora.weights), prefix=None, adapter_name=name, metadata=lora.config()
         )
@@ -326,17 +325,9 @@ def remove_lora(prior: StableDiffusion, name: str) -> None:
     """Take an adapter away; nothing happens when there is none of that name."""
     prior.forget_graphs()
     if name in getattr(prior.unet, "peft_config", {}):
-        with _without_warnings():
+        with warnings.catch_warnings(action="ignore"):
             prior.unet.delete_adapters(name)
     prior.adapters.discard(name)
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Hush peft, which warns whenever there are several adapters; here that is meant."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def lora_parameters(prior: StableDiffusion, name: str) -> dict[str, nn.Parameter]:
@@ -369,13 +360,11 @@ def save_lora(
     cross_attention: int,
     prediction_type: str,
     trigger: str,
-    base: str = "stable-diffusion",
-) -> tuple[Path, ...]:
+) -> tuple[Path, Path]:
     """Write ``lora_diffusers.safetensors`` and ``lora_kohya.safetensors``, always the same bytes.
 
-    kohya's form knows versions of Stable Diffusion alone: for another base it is not written. The
-    base is told by the width of its prompts' embeddings, 768 in Stable Diffusion 1 and 1024 in 2,
-    and by what its schedule predicts; ``trigger`` are the words that call up what was learnt.
+    The base is told by the width of its prompts' embeddings, 768 in Stable Diffusion 1 and 1024 in
+    2, and by what its schedule predicts; ``trigger`` are the words that call up what was learnt.
 
     Raises:
         OSError: A file cannot be written; older ones are still whole.
@@ -396,9 +385,6 @@ def save_lora(
             {"format": "pt", HEADER_KEY: json.dumps(own, sort_keys=True)},
         ),
     )
-
-    if base != "stable-diffusion":
-        return (diffusers_file,)
     kohya_file = Path(folder) / "lora_kohya.safetensors"
     write_file(kohya_file, _kohya_bytes(lora, cross_attention, prediction_type, trigger))
     return diffusers_file, kohya_file

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,11 +26,10 @@ from warpir.core.cache import find_kept, seal
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.draws import generator_of
-from warpir.diffusion.models.tensor_files import serialize
+from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.personalization.class_images import (
     ClassImages,
     Report,
-    class_image_count,
     encode_pictures,
     make_class_images,
 )
@@ -72,13 +71,13 @@ class Personalization:
     evaluation: tuple[float, float] | None
     """Mean squared error of the noise on fixed draws from the photo, without and with the adapter;
     None when a file was loaded."""
-    class_prompts: tuple[str, ...]
-    seconds: dict[str, float]
-    """Time by stage [s]."""
-    is_reused: bool
-    """Whether nothing was trained now."""
-    notices: tuple[str, ...]
+    class_prompts: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
     """What the user is told about."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time by stage [s]."""
+    is_reused: bool = True
+    """Whether nothing was trained now."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a later run needs to go on with this adapter: tensors and plain values."""
@@ -109,8 +108,6 @@ def restore_personalization(prior: StableDiffusion, state: Mapping[str, Any]) ->
         state["losses"],
         errors and (errors[0], errors[1]),
         tuple(state["class_prompts"]),
-        {},
-        True,
         tuple(state["notices"]),
     )
 
@@ -148,12 +145,12 @@ def personalize(
     Raises:
         ModelError: The LoRA cannot be loaded, or ``resume`` is another training's.
         NonFiniteError: The model's numbers are not finite in fp32 either, or stay so in training.
-        ValueError: The photo or a setting has a value that makes no sense.
+        ValueError: The photo has another shape or range.
     """
-    _check(photo, settings)
+    _check(photo)
     if settings.lora is not None:
         lora = load_lora(prior, settings.lora, name)
-        return Personalization(name, lora, torch.zeros(0, 2), None, (), {}, True, ())
+        return Personalization(name, lora, torch.zeros(0, 2), None)
     key = lora_key(prior, photo, prompts, settings, seed)
     stored = cache / "lora" / f"{key}.safetensors" if cache else None
     if stored is not None and (found := _read_stored(stored, name, settings)) is not None:
@@ -215,9 +212,9 @@ def _learn(
         losses,
         (before, after),
         class_images.prompts,
-        clock.seconds,
-        False,
         tuple(notices),
+        clock.seconds,
+        is_reused=False,
     )
     if stored is None:
         return learnt
@@ -328,8 +325,8 @@ def lora_key(
 ) -> str:
     """Return a hash of all that a trained LoRA depends on."""
     # The caller's settings may hold more, such as where results are written.
-    own = (field.name for field in fields(PersonalizeSettings))
-    chosen = [(name, getattr(settings, name)) for name in sorted(own)]
+    own = sorted(each.name for each in fields(PersonalizeSettings))
+    chosen = [(name, getattr(settings, name)) for name in own]
     return content_key(
         FORMAT, model_key(prior), photo.float(), sorted(asdict(prompts).items()), chosen, seed
     )
@@ -357,20 +354,17 @@ def _store(path: Path, learnt: Personalization) -> tuple[str, ...]:
 
 def _read_stored(path: Path, name: str, settings: PersonalizeSettings) -> Personalization | None:
     """Return a LoRA that an earlier run kept, or None when there is none that is whole."""
-    from safetensors import safe_open
-
     kept = find_kept(path)
     if kept is None:
         return None
-    with safe_open(kept, framework="pt", device="cpu") as file:
-        header = json.loads(file.metadata()["record"])
-        tensors = {key: file.get_tensor(key) for key in file.keys()}
+    tensors, about = read_safetensors(kept)
+    header = json.loads(about["record"])
     losses = tensors.pop("losses")
     before, after = header["errors"]
     texts, told = tuple(header["class_prompts"]), tuple(header["notices"])
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in tensors})
     lora = Lora(tensors, dict.fromkeys(layers, float(settings.lora_rank)), settings.lora_layers)
-    return Personalization(name, lora, losses, (before, after), texts, {}, True, told)
+    return Personalization(name, lora, losses, (before, after), texts, told)
 
 
 class _Clock:
@@ -388,18 +382,9 @@ class _Clock:
         self.last = now
 
 
-def _check(photo: Tensor, settings: PersonalizeSettings) -> None:
-    """Raise a ValueError for what makes no sense."""
+def _check(photo: Tensor) -> None:
+    """Raise a ValueError for a photo of another shape or range."""
     if photo.ndim != 4 or photo.shape[:2] != (1, 3):
         raise ValueError(f"photo: shape {tuple(photo.shape)} (expected [1, 3, H, W])")
     if not bool(torch.isfinite(photo).all()) or photo.min() < 0.0 or photo.max() > 1.0:
         raise ValueError("photo: values outside [0, 1]")
-    if not 0.0 < settings.lora_crop <= 1.0:
-        raise ValueError(f"lora_crop: {settings.lora_crop} (expected above 0, at most 1)")
-    for name, least in (
-        ("lora_steps", 0), ("lora_class_batch", 0), ("class_batch", 1), ("class_steps", 1),
-    ):  # fmt: skip
-        if getattr(settings, name) < least:
-            raise ValueError(f"{name}: {getattr(settings, name)} (expected at least {least})")
-    if class_image_count(settings) < 0:
-        raise ValueError(f"class_images: {settings.class_images} (expected at least 0)")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,47 +39,6 @@ LABEL_WIDTH = 180
 """Width of the column with the prompts [px]."""
 
 
-def show_prior(
-    prior: StableDiffusion,
-    prompts: Sequence[str],
-    adapters: Sequence[str | None],
-    seeds: Sequence[int],
-    steps: int,
-    scale: float,
-    batch: int = 8,
-    report: Report | None = None,
-) -> NDArray[np.uint8]:
-    """Return a labelled sheet of samples, shape [H, W, 3]: a row per prompt, a column per adapter.
-
-    A cell has one picture per seed, side by side; the same seed starts from the same noise in every
-    cell. The adapter None is the model as it was; ``report`` is told "samples", the number done and
-    the number in all.
-
-    Raises:
-        ModelError: An adapter is unknown, or the text encoder was freed.
-        NonFiniteError: A picture is not finite.
-        ValueError: There is no prompt, adapter or seed.
-    """
-    if not (prompts and adapters and seeds):
-        raise ValueError("show_prior: needs at least one prompt, one adapter and one seed")
-    asked = [prompt for prompt in prompts for _ in seeds]
-    columns = []
-    for place, adapter in enumerate(adapters):
-
-        def sample(adapter: str | None = adapter) -> Tensor:
-            noises = [*seeds] * len(prompts)
-            return prior.sample(
-                asked, noises, steps=steps, scale=scale, adapter=adapter, batch=batch
-            )
-
-        made = prior.finite(sample, "pictures")
-        columns.append(to_bytes(made).reshape(len(prompts), len(seeds), *made.shape[1:]))
-        if report:
-            report("samples", (place + 1) * len(asked), len(adapters) * len(asked))
-    titles = [TITLES.get(adapter, str(adapter)) for adapter in adapters]
-    return contact_sheet(columns, titles, prompts)
-
-
 def show_personalization(
     prior: StableDiffusion,
     photo: Tensor,
@@ -92,22 +52,33 @@ def show_personalization(
 ) -> NDArray[np.uint8]:
     """Adapt the model to a photo with and without class images, and show what each has learnt.
 
-    The prior has the adapters `WITH_CLASS` and `WITHOUT_CLASS` afterwards. The photo is as for
-    `personalize`, ``shown`` are the prompts of the sheet's rows.
+    A row for each prompt in ``shown``, a column for the model as it was and for each adapter. A
+    cell has one picture per seed, side by side; the same seed starts from the same noise in every
+    cell. The prior has the adapters `WITH_CLASS` and `WITHOUT_CLASS` afterwards. The photo is as
+    for `personalize`; ``report`` is told "samples", the number done and the number in all.
 
     Returns:
-        The sheet, shape [H, W, 3].
+        The labelled sheet, shape [H, W, 3].
 
     Raises:
-        ModelError: As `personalize` and `show_prior`.
+        ModelError: As `personalize`.
+        NonFiniteError: A picture is not finite.
     """
     without = replace(settings, class_images=0, lora=None)
     for name, chosen in ((WITH_CLASS, settings), (WITHOUT_CLASS, without)):
         personalize(prior, photo, prompts, chosen, seed, cache, name=name, report=report)
-    return show_prior(
-        prior, shown, tuple(TITLES), seeds, settings.class_steps, settings.class_scale,
-        settings.class_batch, report,
-    )  # fmt: skip
+    asked, noises = [prompt for prompt in shown for _ in seeds], [*seeds] * len(shown)
+    columns = []
+    for place, adapter in enumerate(TITLES):
+        sample = partial(
+            prior.sample, asked, noises, steps=settings.class_steps, scale=settings.class_scale,
+            adapter=adapter, batch=settings.class_batch,
+        )  # fmt: skip
+        made = prior.finite(sample, "pictures")
+        columns.append(to_bytes(made).reshape(len(shown), len(seeds), *made.shape[1:]))
+        if report:
+            report("samples", (place + 1) * len(asked), len(TITLES) * len(asked))
+    return contact_sheet(columns, [*TITLES.values()], shown)
 
 
 def contact_sheet(

@@ -678,7 +678,7 @@ def test_loss_without_its_adapter_is_refused() -> None:
 def test_loss_of_another_name_is_refused() -> None:
     """The error lists all losses."""
     with pytest.raises(ValueError, match=r"lds, sds, .*, dataset-update \(found 'vsd'\)"):
-        coefficients(replace(ASKED, loss="vsd"))
+        coefficients(replace(ASKED, loss="vsd"), has_adapter=True)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.models.tensor_files import serialize
+from warpir.diffusion.personalization.class_images import to_bytes
 from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
@@ -44,7 +45,6 @@ from warpir.diffusion.personalization.show_prior import (
     WITHOUT_CLASS,
     contact_sheet,
     show_personalization,
-    show_prior,
 )
 from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import make_prompts
@@ -616,23 +616,18 @@ def test_a_given_file_is_loaded_in_place_of_training(
 
 
 @pytest.mark.parametrize(
-    ("photo", "change", "words"),
+    ("photo", "words"),
     [
-        (PHOTO[0], {}, "photo: shape"),
-        (PHOTO * 2.0, {}, "outside"),
-        (PHOTO * float("nan"), {}, "outside"),
-        (PHOTO, {"lora_crop": 0.0}, "lora_crop"),
-        (PHOTO, {"lora_crop": 1.1}, "lora_crop"),
-        (PHOTO, {"lora_steps": -1}, "lora_steps"),
-        (PHOTO, {"class_batch": 0}, "class_batch"),
-        (PHOTO, {"class_images": -1}, "class_images"),
+        (PHOTO[0], "photo: shape"),
+        (PHOTO * 2.0, "outside"),
+        (PHOTO * float("nan"), "outside"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
-    epsilon: StableDiffusion, photo: Tensor, change: dict[str, Any], words: str
+def test_photos_that_make_no_sense_are_refused(
+    epsilon: StableDiffusion, photo: Tensor, words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
-        personalize(epsilon, photo, PROMPTS, replace(SETTINGS, **change), 0, None)
+        personalize(epsilon, photo, PROMPTS, SETTINGS, 0, None)
 
 
 # Looking
@@ -690,16 +685,11 @@ def test_the_model_is_shown_before_and_after(epsilon: StableDiffusion, tmp_path:
     bodies = [column[-2 * side - 12 :] for column in columns]
     assert not any(np.array_equal(bodies[a], bodies[b]) for a, b in ((0, 1), (1, 2), (0, 2)))
     # In the same batches: what a picture is made beside changes its last bits on some processors.
-    alone = show_prior(epsilon, shown, [WITHOUT_CLASS], [0, 1], 2, 1.0, settings.class_batch)
-    assert np.array_equal(bodies[2], alone[:, LABEL_WIDTH:][-2 * side - 12 :, : 2 * side])
+    asked = [prompt for prompt in shown for _ in range(2)]
+    alone = epsilon.sample(asked, [0, 1] * 2, steps=2, scale=1.0, adapter=WITHOUT_CLASS)
+    expected = contact_sheet([to_bytes(alone).reshape(2, 2, *alone.shape[1:])], [""], shown)
+    assert np.array_equal(bodies[2], expected[:, LABEL_WIDTH:][-2 * side - 12 :, : 2 * side])
     told: list[str] = []
     again = show_personalization(*arguments, report=lambda stage, *_: told.append(stage))
     assert np.array_equal(again, sheet)
     assert set(told) == {"samples"}
-
-
-def test_a_sheet_of_nothing_is_refused(epsilon: StableDiffusion) -> None:
-    with pytest.raises(ValueError, match="at least one"):
-        show_prior(epsilon, [], [None], [0], 2, 1.0)
-    with pytest.raises(ModelError, match="no adapter"):
-        show_prior(epsilon, ["a car"], ["scene"], [0], 2, 1.0)
