@@ -1,10 +1,12 @@
 """The glTF metallic-roughness BRDF: values, sampling, energy, gradients."""
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.stability.case import upload
+from benchmarks.stability.case import launch, upload
 from tests import oracles as o
 from tests.statistics import chi_square, compare_gradients, graded_edges
 from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample
@@ -36,26 +38,15 @@ def eval_kernel(
     roughness: wp.array[float],
     diffuse: wp.array[wp.vec3],
     specular: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    value = bsdf_f(bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers()), wi[i])
-    diffuse[i] = value.diffuse
-    specular[i] = value.specular
-
-
-@wp.kernel
-def pdf_kernel(
-    wo: wp.array[wp.vec3],
-    wi: wp.array[wp.vec3],
-    base_color: wp.array[wp.vec3],
-    metallic: wp.array[float],
-    roughness: wp.array[float],
     pdf: wp.array[float],
     p_specular: wp.array[float],
 ):
     i = wp.tid()
     bsdf = bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], Layers())
-    pdf[i] = bsdf_f(bsdf, wi[i]).pdf
+    value = bsdf_f(bsdf, wi[i])
+    diffuse[i] = value.diffuse
+    specular[i] = value.specular
+    pdf[i] = value.pdf
     p_specular[i] = bsdf.p[1]
 
 
@@ -71,6 +62,9 @@ def sample_kernel(
 ):
     i = wp.tid()
     wi[i] = bsdf_sample(bsdf_of(wo, base_color, metallic, roughness, Layers()), u[i], u_lobe[i])
+
+
+OUTPUTS = (wp.vec3, wp.vec3, float, float)
 
 
 class Case:
@@ -100,19 +94,9 @@ class Case:
             upload(self.roughness, float, device, requires_grad),
         ]
 
-    def evaluate(self, device: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the kernel's diffuse and specular parts, shape [row, 3]."""
-        out = [wp.zeros(len(self.wo), dtype=wp.vec3, device=device) for _ in range(2)]
-        wp.launch(eval_kernel, len(self.wo), inputs=self.arrays(device), outputs=out, device=device)
-        diffuse, specular = (a.numpy().astype(np.float64) for a in out)
-        return diffuse, specular
-
-    def density(self, device: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the kernel's density and its probability of the specular lobe."""
-        out = [wp.zeros(len(self.wo), dtype=float, device=device) for _ in range(2)]
-        wp.launch(pdf_kernel, len(self.wo), inputs=self.arrays(device), outputs=out, device=device)
-        pdf, p = (a.numpy().astype(np.float64) for a in out)
-        return pdf, p
+    def evaluate(self, device: str) -> list[np.ndarray]:
+        """Return diffuse and specular, [row, 3], density and probability of the specular lobe."""
+        return launch(eval_kernel, len(self.wo), self.arrays(device), *OUTPUTS, device=device)
 
     def oracle(self) -> np.ndarray:
         """Return the specification's value, shape [row, 3]."""
@@ -133,12 +117,10 @@ def draw(
     device: str,
     count: int = SAMPLE_COUNT,
 ) -> np.ndarray:
-    wi = wp.zeros(count, dtype=wp.vec3, device=device)
     u = upload(rng.random((count, 2), dtype=np.float32), wp.vec2, device)
     u_lobe = upload(rng.random(count, dtype=np.float32), float, device)
     inputs = [wp.vec3(*map(float, wo)), u, u_lobe, wp.vec3(base_color), metallic, roughness]
-    wp.launch(sample_kernel, count, inputs=inputs, outputs=[wi], device=device)
-    return wi.numpy().astype(np.float64)
+    return launch(sample_kernel, count, inputs, wp.vec3, device=device)[0]
 
 
 def random_case(rng: np.random.Generator, count: int, cos_min: float = 1e-3) -> Case:
@@ -160,7 +142,7 @@ def random_case(rng: np.random.Generator, count: int, cos_min: float = 1e-3) -> 
 def test_brdf_matches_oracle(device: str, rng: np.random.Generator) -> None:
     """Diffuse plus specular is glTF's mix for any material, also at grazing angles."""
     case = random_case(rng, 30000)
-    diffuse, specular = case.evaluate(device)
+    diffuse, specular, *_ = case.evaluate(device)
     np.testing.assert_allclose(diffuse + specular, case.oracle(), rtol=VALUE_RTOL, atol=VALUE_ATOL)
 
 
@@ -175,14 +157,14 @@ def test_brdf_matches_oracle_on_smooth_surfaces(
     wi = 2 * o.dot(wo, wm)[:, None] * wm - wo
     keep = wi[:, 2] > 0.01
     case = Case(wo[keep], wi[keep], rng.random((int(keep.sum()), 3)), 1.0, roughness)
-    _, specular = case.evaluate(device)
+    specular = case.evaluate(device)[1]
     np.testing.assert_allclose(specular, case.oracle(), rtol=VALUE_RTOL, atol=VALUE_ATOL)
 
 
 def test_brdf_parts(device: str, rng: np.random.Generator) -> None:
     """The split is the specification's: what the dielectric's Fresnel term leaves is diffuse."""
     case = random_case(rng, 5000)
-    diffuse, specular = case.evaluate(device)
+    diffuse, specular, *_ = case.evaluate(device)
     f0 = (
         o.DIELECTRIC_F0
         + (case.base_color.astype(np.float64) - o.DIELECTRIC_F0) * case.metallic[:, None]
@@ -200,7 +182,7 @@ def test_brdf_is_reciprocal(device: str, rng: np.random.Generator) -> None:
     """``f(wo, wi) = f(wi, wo)`` (Helmholtz)."""
     case = random_case(rng, 20000)
     swapped = Case(case.wi, case.wo, case.base_color, case.metallic, case.roughness)
-    there, back = (np.add(*c.evaluate(device)) for c in (case, swapped))
+    there, back = (np.add(*c.evaluate(device)[:2]) for c in (case, swapped))
     # float32 directions are not quite unit vectors, so wo . wm and wi . wm differ by 1e-7; near
     # grazing Schlick's fifth power turns that into a share of the whole term.
     wm = o.normalize(case.wo.astype(np.float64) + case.wi)
@@ -214,8 +196,7 @@ def test_brdf_is_zero_below_the_surface(device: str) -> None:
     up, down, flat = [0.6, 0, 0.8], [0.6, 0, -0.8], [1.0, 0, 0]
     pairs = [(up, down), (down, up), (down, down), (up, flat), (flat, up)]
     case = Case(np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), 0.8, 0.3, 0.4)
-    assert np.all(np.add(*case.evaluate(device)) == 0.0)
-    assert np.all(case.density(device)[0] == 0.0)
+    assert all(np.all(values == 0.0) for values in case.evaluate(device)[:3])
 
 
 @pytest.mark.parametrize("cos_min", [1e-12, 1e-18, 1e-30])
@@ -226,9 +207,7 @@ def test_brdf_is_finite_at_extreme_angles(device: str, cos_min: float) -> None:
     for phi in (0.0, np.pi, 1.0):
         for roughness in (0.0, 0.5, 1.0):
             case = Case(o.spherical(wo, 0.0), o.spherical(wi, phi), 1.0, 0.5, roughness)
-            diffuse, specular = case.evaluate(device)
-            pdf, _ = case.density(device)
-            for values in (diffuse, specular, pdf):
+            for values in case.evaluate(device)[:3]:
                 assert np.all(np.isfinite(values)) and np.all(values >= 0.0)
 
 
@@ -238,7 +217,7 @@ def test_brdf_is_finite_at_extreme_angles(device: str, cos_min: float) -> None:
 def test_brdf_pdf_matches_oracle(device: str, rng: np.random.Generator) -> None:
     """A mix of visible-normal reflection (Heitz 2018) and the cosine, with a proper probability."""
     case = random_case(rng, 20000)
-    pdf, p = case.density(device)
+    _, _, pdf, p = case.evaluate(device)
     assert p.min() > 0.0 and p.max() <= 1.0
     expected = p * o.vndf_reflection_pdf(case.wo, case.wi, o.ggx_alpha(case.roughness))
     expected += (1.0 - p) * o.cosine_pdf(case.wi)
@@ -258,7 +237,7 @@ def check_sampling(
     # The camera's azimuth is a general one; cells are taken about the mirror direction's.
     wo = outgoing(cos_o, 0.8)
     wi = draw(wo, 0.7, metallic, roughness, rng, device, count)
-    _, p = Case(wo[None], wo[None], 0.7, metallic, roughness).density(device)
+    p = Case(wo[None], wo[None], 0.7, metallic, roughness).evaluate(device)[3]
     alpha = float(o.ggx_alpha(roughness))
 
     def pdf(d: np.ndarray) -> np.ndarray:
@@ -320,9 +299,8 @@ def albedo_samples(
     """Return one estimate ``f cos / pdf`` of the directional albedo per sample."""
     wo = outgoing(cos_o)
     wi = draw(wo, base, metallic, roughness, rng, device)
-    case = Case(wo, wi, base, metallic, roughness)
-    value = np.add(*case.evaluate(device))[:, 0] * np.maximum(wi[:, 2], 0.0)
-    pdf, _ = case.density(device)
+    diffuse, specular, pdf, _ = Case(wo, wi, base, metallic, roughness).evaluate(device)
+    value = (diffuse + specular)[:, 0] * np.maximum(wi[:, 2], 0.0)
     return np.divide(value, pdf, out=np.zeros_like(value), where=pdf > 0.0)
 
 
@@ -350,7 +328,7 @@ def test_lambert_furnace(device: str) -> None:
     wi = o.spherical(cos_i[:, None], phi).reshape(-1, 3)
     for cos_o in COS_O:
         wo = outgoing(cos_o)
-        diffuse, _ = Case(wo, wi, 1.0, 0.0, 1.0).evaluate(device)
+        diffuse = Case(wo, wi, 1.0, 0.0, 1.0).evaluate(device)[0]
         left = 1.0 - o.schlick(o.DIELECTRIC_F0, o.dot(wo, o.normalize(wo + wi)))
         lambert = (diffuse[:, 0] / left).reshape(len(cos_i), 64).mean(axis=1)
         assert 2 * np.pi * np.sum(lambert * cos_i * weight) == pytest.approx(1.0, abs=1e-4)
@@ -382,43 +360,37 @@ def test_sample_weights_are_bounded(device: str, rng: np.random.Generator, metal
 # ------------------------------------------------------------------------------ gradients
 
 
+def row_gradients(
+    loss: Callable[..., np.ndarray], factors: dict[str, np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Yield central differences of each row's loss by its own value of each factor."""
+    h = 1e-5
+    for name, value in factors.items():
+        value = value.astype(np.float64)
+        steps = h * (np.eye(3) if value.ndim == 2 else np.ones(1))
+        columns = [loss(**{name: value + s}) - loss(**{name: value - s}) for s in steps]
+        yield np.stack(columns, axis=-1).reshape(value.shape) / (2 * h)
+
+
 def test_brdf_gradient(device: str, rng: np.random.Generator) -> None:
     """Adjoints of base colour, metallic and roughness against float64 central differences."""
     case = random_case(rng, 400, cos_min=0.02)
     case.roughness = rng.uniform(0.1, 1.0, 400).astype(np.float32)
     case.metallic = rng.uniform(0.05, 0.95, 400).astype(np.float32)
     arrays = case.arrays(device, requires_grad=True)
-    out = [wp.zeros(400, dtype=wp.vec3, device=device, requires_grad=True) for _ in range(2)]
+    out = [wp.zeros(400, dtype=kind, device=device, requires_grad=True) for kind in OUTPUTS]
     y = rng.normal(size=(400, 3)).astype(np.float32)
     # Peaks would drown everything else: each row is scaled to a value of about 1.
     y /= (1.0 + case.oracle().max(axis=1, keepdims=True)).astype(np.float32)
     with wp.Tape() as tape:
         wp.launch(eval_kernel, 400, inputs=arrays, outputs=out, device=device)
-    tape.backward(grads={a: upload(y, wp.vec3, device) for a in out})
+    tape.backward(grads={a: upload(y, wp.vec3, device) for a in out[:2]})
+    factors = {name: getattr(case, name) for name in ("base_color", "metallic", "roughness")}
 
-    def rows(base: np.ndarray, metallic: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        value = o.gltf_brdf(case.wo, case.wi, base, metallic, roughness)
-        return np.sum(value * y, axis=-1)
+    def loss(**moved: np.ndarray) -> np.ndarray:
+        return np.sum(o.gltf_brdf(case.wo, case.wi, **{**factors, **moved}) * y, axis=-1)
 
-    base, metallic, roughness = (
-        a.astype(np.float64) for a in (case.base_color, case.metallic, case.roughness)
-    )
-    h = 1e-5
-    d_metallic = (rows(base, metallic + h, roughness) - rows(base, metallic - h, roughness)) / (
-        2 * h
-    )
-    d_roughness = (rows(base, metallic, roughness + h) - rows(base, metallic, roughness - h)) / (
-        2 * h
-    )
-    d_base = np.stack(
-        [
-            (rows(base + h * e, metallic, roughness) - rows(base - h * e, metallic, roughness))
-            / (2 * h)
-            for e in np.eye(3)
-        ],
-        axis=-1,
-    )
-    for array, expected in zip(arrays[2:], (d_base, d_metallic, d_roughness), strict=True):
+    for array, expected in zip(arrays[2:], row_gradients(loss, factors), strict=True):
         match = compare_gradients(array.grad.numpy(), expected)
         assert match.relative_l2 < GRADIENT_RELATIVE_L2, match
 
@@ -433,9 +405,9 @@ def test_brdf_gradient_is_finite_everywhere(device: str) -> None:
     )
     case = Case(wo, wi, 0.0, 1.0, 0.0)
     arrays = case.arrays(device, requires_grad=True)
-    out = [wp.zeros(len(wo), dtype=wp.vec3, device=device, requires_grad=True) for _ in range(2)]
+    out = [wp.zeros(len(wo), dtype=kind, device=device, requires_grad=True) for kind in OUTPUTS]
     with wp.Tape() as tape:
         wp.launch(eval_kernel, len(wo), inputs=arrays, outputs=out, device=device)
-    tape.backward(grads={a: upload(np.ones((len(wo), 3)), wp.vec3, device) for a in out})
+    tape.backward(grads={a: upload(np.ones((len(wo), 3)), wp.vec3, device) for a in out[:2]})
     for array in arrays[2:]:
         assert np.all(np.isfinite(array.grad.numpy()))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.stability.case import upload
+from benchmarks.stability.case import download, launch, upload
 from tests import oracles as o
 from tests.kernels.test_brdf import (
     GRADIENT_RELATIVE_L2,
@@ -15,6 +15,7 @@ from tests.kernels.test_brdf import (
     Z_MAX,
     outgoing,
     random_case,
+    row_gradients,
 )
 from tests.oracles import LayeredMaterial
 from tests.statistics import chi_square, compare_gradients
@@ -185,7 +186,7 @@ class Rows:
 
     def evaluate(self, device: str) -> list[np.ndarray]:
         """Return diffuse, specular, density and lobe probabilities."""
-        return [a.numpy().astype(np.float64) for a in self.launch(device)[1]]
+        return [download(a) for a in self.launch(device)[1]]
 
     def oracle(self) -> np.ndarray:
         """Return the specifications' value, shape [row, 3]."""
@@ -256,7 +257,6 @@ def sample(
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Draw `SAMPLE_COUNT` directions; ``base`` is its colour, metallic and roughness."""
-    drawn = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
     inputs = [
         wp.vec3(*map(float, wo)),
         upload(rng.random((SAMPLE_COUNT, 3)), wp.vec3, device),
@@ -266,8 +266,7 @@ def sample(
         wp.vec3(*base[0]),
         *base[1:],
     ]
-    wp.launch(sample_kernel, SAMPLE_COUNT, inputs=inputs, outputs=[drawn], device=device)
-    return drawn.numpy().astype(np.float64)
+    return launch(sample_kernel, SAMPLE_COUNT, inputs, wp.vec3, device=device)[0]
 
 
 @pytest.mark.parametrize("cos_o", [COS_O, 0.25])
@@ -349,10 +348,8 @@ def film_kernel(
 def film(f0: np.ndarray, *numbers: np.ndarray, device: str) -> np.ndarray:
     """Return the kernel's reflectance of films; ``numbers`` are index, thickness and cosine."""
     rows = np.broadcast_arrays(*numbers, f0[..., 0])[:3]
-    arrays = [upload(a, float, device) for a in rows]
-    out = wp.zeros(len(rows[0]), dtype=wp.vec3, device=device)
-    wp.launch(film_kernel, len(rows[0]), [upload(f0, wp.vec3, device), *arrays, out], device=device)
-    return out.numpy()
+    inputs = [upload(f0, wp.vec3, device), *(upload(a, float, device) for a in rows)]
+    return launch(film_kernel, len(rows[0]), inputs, wp.vec3, device=device)[0]
 
 
 def test_film_reflects_a_share(device: str, rng: np.random.Generator) -> None:
@@ -454,27 +451,12 @@ def test_layers_gradient(device: str, rng: np.random.Generator, name: str) -> No
     with wp.Tape() as tape:
         factors, out = rows.launch(device, free=True)
     tape.backward(grads={a: upload(y, wp.vec3, device) for a in out[:2]})
-    plain = {
-        "base_color": rows.base_color.astype(np.float64),
-        "metallic": rows.metallic.astype(np.float64),
-        "roughness": rows.roughness.astype(np.float64),
-    }
-    h = 1e-5
+    plain = {name: getattr(rows, name) for name in ("base_color", "metallic", "roughness")}
 
     def loss(**moved: np.ndarray) -> np.ndarray:
-        values = {**plain, **moved}
-        base, coat = o.layered_brdf(
-            rows.wo, rows.wi, values["base_color"], values["metallic"], values["roughness"],
-            rows.layers,
-        )  # fmt: skip
+        base, coat = o.layered_brdf(rows.wo, rows.wi, layers=rows.layers, **{**plain, **moved})
         return np.asarray(np.sum((base + coat) * y, axis=1))
 
-    for array, (key, value) in zip(factors, plain.items(), strict=True):
-        steps = h * np.eye(3) if value.ndim == 2 else np.array([h])
-        expected = np.stack(
-            [(loss(**{key: value + s}) - loss(**{key: value - s})) / (2 * h) for s in steps],
-            axis=-1,
-        )
-        found = array.grad.numpy().reshape(expected.shape)
-        match = compare_gradients(found, expected)
-        assert match.relative_l2 < GRADIENT_RELATIVE_L2, (key, match)
+    for array, expected in zip(factors, row_gradients(loss, plain), strict=True):
+        match = compare_gradients(array.grad.numpy(), expected)
+        assert match.relative_l2 < GRADIENT_RELATIVE_L2, match

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.stability.case import upload
+from benchmarks.stability.case import differentiate, launch, upload
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients, warp_agrees
 from warpir.kernels.composite import compose, tone_foreground, tone_shadow
@@ -77,28 +77,14 @@ class Scene:
         display, image = empty(40, device), empty(96, device)
         with wp.Tape() as tape:
             wp.launch(shadow_ratio, 56, inputs=[lit, unoccluded], outputs=[ratio], device=device)
-            wp.launch(
-                tone_shadow,
-                56,
-                inputs=[ratio, *free[6:], 5],
-                outputs=[ratio_display],
-                device=device,
-            )
-            wp.launch(
-                tone_foreground,
-                40,
-                inputs=[foreground, mask, is_reinhard, *free[3:6], 5],
-                outputs=[display],
-                device=device,
-            )
+            inputs = [ratio, *free[6:], 5]
+            wp.launch(tone_shadow, 56, inputs=inputs, outputs=[ratio_display], device=device)
+            inputs = [foreground, mask, is_reinhard, *free[3:6], 5]
+            wp.launch(tone_foreground, 40, inputs=inputs, outputs=[display], device=device)
             index = [ints(self.object_index, device), ints(self.receiver_index, device)]
-            wp.launch(
-                compose,
-                96,
-                inputs=[upload(self.photo, wp.vec3, device), *index, mask, display, ratio_display],
-                outputs=[image],
-                device=device,
-            )
+            photo = upload(self.photo, wp.vec3, device)
+            inputs = [photo, *index, mask, display, ratio_display]
+            wp.launch(compose, 96, inputs=inputs, outputs=[image], device=device)
         return free, image, tape
 
 
@@ -124,18 +110,8 @@ def test_composite_gradient(device: str, rng: np.random.Generator) -> None:
         moved = [x if i == k else v for i, v in enumerate(values)]
         return float(np.sum(y * scene.oracle(*moved[:3], tuple(moved[3:6]), tuple(moved[6:]))))
 
-    names = [
-        "foreground",
-        "lit",
-        "unoccluded",
-        "x_fg",
-        "y_fg",
-        "slope_fg",
-        "x_sh",
-        "y_sh",
-        "slope_sh",
-    ]
-    for k, name in enumerate(names):
+    names = "foreground lit unoccluded x_fg y_fg slope_fg x_sh y_sh slope_sh"
+    for k, name in enumerate(names.split()):
         reference = central_differences(lambda x, k=k: loss(k, x), values[k], 1e-6)
         gradient = free[k].grad.numpy().astype(np.float64)
         if name.startswith("x_"):
@@ -210,13 +186,11 @@ def test_shadow_ratio_of_special_values(device: str) -> None:
         [[1.0, 0.3, 7e4], [1.0, 2.0, 1e9], [0.0, 0.0, 1.0], [1e-30, 0.0, 1e30]], np.float32
     )
     expected = [[1, 1, 1], [0, 0, 0], [1, 1, 0.5], [1, 1, 1]]
-    arrays = [upload(lit, wp.vec3, device, True), upload(unoccluded, wp.vec3, device, True)]
-    out = empty(4, device)
-    with wp.Tape() as tape:
-        wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
-    assert np.array_equal(out.numpy(), np.array(expected, np.float32))
-    tape.backward(grads={out: upload(np.ones((4, 3)), wp.vec3, device)})
-    d_lit, d_unoccluded = (a.grad.numpy() for a in arrays)
+    inputs = [upload(x, wp.vec3, device, True) for x in (lit, unoccluded)]
+    (ratio,), (d_lit, d_unoccluded) = differentiate(
+        shadow_ratio, inputs, np.ones((4, 3)), wp.vec3, device=device
+    )
+    assert np.array_equal(ratio, expected)
     assert np.all(np.isfinite(d_lit)) and np.all(np.isfinite(d_unoccluded[:3]))
     assert d_lit[2, 2] == 1.0 and d_unoccluded[2, 2] == -0.5
     assert np.all(d_lit[2, :2] == 0.0) and np.all(d_unoccluded[2, :2] == 0.0)
@@ -225,13 +199,12 @@ def test_shadow_ratio_of_special_values(device: str) -> None:
 def test_shadow_ratio_of_underflowing_light_is_one(device: str) -> None:
     """What underflow leaves of a lobe's tail is no light: ratio 1, gradients 0 and not infinite."""
     unoccluded = np.repeat(np.array([[1e-45], [1e-40], [1e-38], [1e-31]], np.float32), 3, axis=1)
-    arrays = [upload(x, wp.vec3, device, True) for x in (0.5 * unoccluded, unoccluded)]
-    out = empty(4, device)
-    with wp.Tape() as tape:
-        wp.launch(shadow_ratio, 4, inputs=arrays, outputs=[out], device=device)
-    tape.backward(grads={out: upload(np.ones((4, 3)), wp.vec3, device)})
-    assert np.all(out.numpy() == 1.0)
-    assert all(np.all(a.grad.numpy() == 0.0) for a in arrays)
+    inputs = [upload(x, wp.vec3, device, True) for x in (0.5 * unoccluded, unoccluded)]
+    (ratio,), gradients = differentiate(
+        shadow_ratio, inputs, np.ones((4, 3)), wp.vec3, device=device
+    )
+    assert np.all(ratio == 1.0)
+    assert all(np.all(gradient == 0.0) for gradient in gradients)
 
 
 def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random.Generator) -> None:
@@ -240,36 +213,28 @@ def test_shadow_ratio_ignores_the_scale_of_the_light(device: str, rng: np.random
     lit = unoccluded * rng.random((64, 3), dtype=np.float32)
     ratios = []
     for scale in (1.0, 2.0**20, 2.0**-20):
-        out = empty(64, device)
-        inputs = [upload(lit * scale, wp.vec3, device), upload(unoccluded * scale, wp.vec3, device)]
-        wp.launch(shadow_ratio, 64, inputs=inputs, outputs=[out], device=device)
-        ratios.append(out.numpy())
+        inputs = [upload(x * scale, wp.vec3, device) for x in (lit, unoccluded)]
+        ratios += launch(shadow_ratio, 64, inputs, wp.vec3, device=device)
     assert np.array_equal(ratios[0], ratios[1]) and np.array_equal(ratios[0], ratios[2])
     assert ratios[0].min() >= 0.0 and ratios[0].max() <= 1.0
 
 
-def photo_only(photo: np.ndarray, device: str) -> tuple[wp.array, wp.array, wp.Tape]:
-    """Encode a photo by the composite kernel without object or plane."""
-    count = len(photo)
-    source, image = upload(photo, wp.vec3, device, True), empty(count, device)
-    none = ints(np.full(count, -1), device)
-    dummy = [
-        upload(np.zeros(1), float, device),
-        upload(np.zeros((1, 3)), wp.vec3, device),
-        upload(np.zeros((1, 3)), wp.vec3, device),
-    ]
-    with wp.Tape() as tape:
-        wp.launch(
-            compose, count, inputs=[source, none, none, *dummy], outputs=[image], device=device
-        )
-    return source, image, tape
+def photo_only(photo: np.ndarray, device: str) -> tuple[np.ndarray, np.ndarray]:
+    """Encode a photo by the composite kernel without object or plane; its gradient beside it."""
+    none = ints(np.full(len(photo), -1), device)
+    dummy = upload(np.zeros(1), float, device), *[upload(np.zeros((1, 3)), wp.vec3, device)] * 2
+    inputs = [upload(photo, wp.vec3, device, True), none, none, *dummy]
+    (image,), (gradient,) = differentiate(
+        compose, inputs, np.ones(photo.shape), wp.vec3, device=device
+    )
+    return image, gradient
 
 
 def test_encode_every_8_bit_code(device: str) -> None:
     """Decoding and encoding returns each of 256 codes exactly after rounding (``x^2.2``)."""
     code = np.arange(256)
     linear = np.repeat(((code / 255.0) ** 2.2)[:, None], 3, axis=1)
-    image = photo_only(linear, device)[1].numpy()
+    image = photo_only(linear, device)[0]
     assert np.array_equal(np.round(255.0 * image[:, 0]).astype(int), code)
     assert np.abs(image[:, 0] - code / 255.0).max() < 1e-6
 
@@ -277,12 +242,10 @@ def test_encode_every_8_bit_code(device: str) -> None:
 def test_encode_is_finite_and_monotone(device: str) -> None:
     """Black and negative give 0, more than 1 gives 1, slopes stay finite, below half a code too."""
     x = np.concatenate([[-1.0, -1e-9, 0.0], np.geomspace(1e-30, 10.0, 2000)])
-    source, image, tape = photo_only(np.repeat(x[:, None], 3, axis=1), device)
-    y = image.numpy()[:, 0].astype(np.float64)
+    image, gradient = photo_only(np.repeat(x[:, None], 3, axis=1), device)
+    y, gradient = image[:, 0], gradient[:, 0]
     assert np.all(y[:3] == 0.0) and y[-1] == 1.0
     assert np.diff(y).min() >= -1e-7
-    tape.backward(grads={image: upload(np.ones((len(x), 3)), wp.vec3, device)})
-    gradient = source.grad.numpy()[:, 0]
     assert np.all(np.isfinite(gradient)) and np.all(gradient >= 0.0)
     # Half of one 8-bit code is the most that the linear foot may change.
     assert np.abs(y - o.encode(np.clip(x, 0.0, 1.0))).max() < 0.5 / 255.0
@@ -290,19 +253,18 @@ def test_encode_is_finite_and_monotone(device: str) -> None:
     np.testing.assert_allclose(gradient[inside], x[inside] ** (1 / 2.2 - 1) / 2.2, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kernel", ["tone_foreground", "tone_shadow", "shadow_ratio"])
-def test_gradcheck(device: str, rng: np.random.Generator, kernel: str) -> None:
+@pytest.mark.parametrize(
+    "kernel", [tone_foreground, tone_shadow, shadow_ratio], ids=lambda kernel: kernel.key
+)
+def test_gradcheck(device: str, rng: np.random.Generator, kernel: wp.Kernel) -> None:
     """Warp's own finite differences agree with each kernel's adjoint."""
     scene = Scene(rng, raw_scale=0.2)
     # Mid-bin values, so that a step does not cross a knot.
     middle = lambda knots, c: 0.5 * (knots[0][c, 1:] + knots[0][c, :-1])  # noqa: E731
     out = empty(5, device)
-    if kernel == "shadow_ratio":
-        inputs = [
-            upload(scene.lit[:5], wp.vec3, device, True),
-            upload(scene.unoccluded[:5], wp.vec3, device, True),
-        ]
-    elif kernel == "tone_shadow":
+    if kernel is shadow_ratio:
+        inputs = [upload(x[:5], wp.vec3, device, True) for x in (scene.lit, scene.unoccluded)]
+    elif kernel is tone_shadow:
         ratio = np.stack([middle(scene.knots_shadow, c) for c in range(3)], axis=-1)
         inputs = [
             upload(ratio, wp.vec3, device, True),
@@ -318,9 +280,4 @@ def test_gradcheck(device: str, rng: np.random.Generator, kernel: str) -> None:
             *(upload(k, float, device, True) for k in scene.knots_fg),
             5,
         ]
-    function = {
-        "tone_foreground": tone_foreground,
-        "tone_shadow": tone_shadow,
-        "shadow_ratio": shadow_ratio,
-    }
-    assert warp_agrees(function[kernel], inputs, out)
+    assert warp_agrees(kernel, inputs, out)

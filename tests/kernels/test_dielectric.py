@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import launch, upload
 from tests.oracles import fresnel
 from tests.statistics import chi_square
 from warpir.core.arrays import Float64Array
@@ -77,39 +78,33 @@ def values(
     wo: Float64Array, eta: float, alpha: float, wi: Float64Array, device: str
 ) -> Float64Array:
     """``f |cos|``, RGB, and the density, shape [direction, 4]."""
-    flat = wi.reshape(-1, 3)
-    out = wp.zeros(len(flat), dtype=wp.vec4, device=device)
-    directions = wp.array(flat.astype(np.float32), dtype=wp.vec3, device=device)
-    wp.launch(value_kernel, len(flat), [wp.vec3(*wo), eta, alpha, directions], [out], device=device)
-    return out.numpy().astype(float).reshape(*wi.shape[:-1], 4)
+    inputs = [wp.vec3(*wo), eta, alpha, upload(wi.reshape(-1, 3), wp.vec3, device)]
+    (found,) = launch(value_kernel, wi.size // 3, inputs, wp.vec4, device=device)
+    return found.reshape(*wi.shape[:-1], 4)
 
 
-def draws(wo: Float64Array, eta: float, alpha: float, device: str) -> tuple[Float64Array, ...]:
+def draws(wo: Float64Array, eta: float, alpha: float, device: str) -> list[Float64Array]:
     """Directions, weights and densities of `SAMPLE_COUNT` draws."""
     u = np.random.default_rng(3).random((SAMPLE_COUNT, 3), np.float32)
-    out = [wp.zeros(len(u), dtype=t, device=device) for t in (wp.vec3, wp.vec3, float)]
-    inputs = [wp.vec3(*wo), eta, alpha, wp.array(u, dtype=wp.vec3, device=device)]
-    wp.launch(sample_kernel, len(u), inputs, out, device=device)
-    return tuple(a.numpy().astype(float) for a in out)
+    inputs = [wp.vec3(*wo), eta, alpha, upload(u, wp.vec3, device)]
+    return launch(sample_kernel, len(u), inputs, wp.vec3, wp.vec3, float, device=device)
 
 
 @pytest.mark.parametrize("eta", INDICES)
 def test_fresnel_and_snell_are_those_of_float64(eta: float, device: str) -> None:
     """Also beyond the critical angle, where all is reflected."""
     wo = at(np.linspace(0.001, 0.9999, 4001)).astype(np.float32)
-    F = wp.zeros(len(wo), dtype=float, device=device)
-    wt = wp.zeros(len(wo), dtype=wp.vec3, device=device)
-    inputs = [wp.array(wo, dtype=wp.vec3, device=device), eta]
-    wp.launch(smooth_kernel, len(wo), inputs, [F, wt], device=device)
+    inputs = [upload(wo, wp.vec3, device), eta]
+    F, wt = launch(smooth_kernel, len(wo), inputs, float, wp.vec3, device=device)
     cos_o = wo[:, 2].astype(float)
     sin_t = np.sqrt(1.0 - cos_o**2) / eta
     # Next to the critical angle the slope is infinite.
     clear = np.abs(sin_t - 1.0) > 1e-5
-    np.testing.assert_allclose(F.numpy()[clear], fresnel(cos_o, eta)[clear], rtol=2e-4, atol=2e-6)
-    assert (F.numpy()[sin_t > 1.0 + 1e-5] == 1.0).all()
+    np.testing.assert_allclose(F[clear], fresnel(cos_o, eta)[clear], rtol=2e-4, atol=2e-6)
+    assert (F[sin_t > 1.0 + 1e-5] == 1.0).all()
     assert (sin_t > 1.0 + 1e-5).any() == (eta < 1.0)
     passes = clear & (sin_t < 1.0)
-    found = wt.numpy()[passes].astype(float)
+    found = wt[passes]
     expected = np.stack(
         [-wo[:, 0] / eta, -wo[:, 1] / eta, -np.sqrt(np.maximum(1.0 - sin_t**2, 0.0))], axis=-1
     )[passes]
@@ -118,10 +113,9 @@ def test_fresnel_and_snell_are_those_of_float64(eta: float, device: str) -> None
 
 def test_fresnel_at_normal_incidence(device: str) -> None:
     """((n - 1) / (n + 1))^2, 4 % for glass."""
-    wo = wp.array([[0.0, 0.0, 1.0]], dtype=wp.vec3, device=device)
-    F, wt = wp.zeros(1, dtype=float, device=device), wp.zeros(1, dtype=wp.vec3, device=device)
-    wp.launch(smooth_kernel, 1, [wo, 1.5], [F, wt], device=device)
-    assert F.numpy()[0] == pytest.approx(0.04, abs=1e-7)
+    inputs = [upload([[0.0, 0.0, 1.0]], wp.vec3, device), 1.5]
+    F, _ = launch(smooth_kernel, 1, inputs, float, wp.vec3, device=device)
+    assert F[0] == pytest.approx(0.04, abs=1e-7)
 
 
 def walter(wo: Float64Array, wi: Float64Array, eta: float, alpha: float) -> Float64Array:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import launch
 from tests.kernels.test_lamps import INSIDE, NORMALS, POINTS, RECTANGLE, SPHERE
 from tests.statistics import central_differences
 from warpir.core.arrays import Float64Array
@@ -35,11 +36,9 @@ def rim_kernel(lamps: LampArgs, p: wp.vec3, normal: wp.vec3, side: int, slope: w
 def found(lamp: Lamp, point: Float64Array, normal: Float64Array, device: str) -> Float64Array:
     """Derivative of irradiance by radiance 1 to x, y and z."""
     args = lamp_args([lamp], np.zeros(3), wp.get_device(device))
-    slope = wp.zeros(SIDE * SIDE, dtype=wp.vec3, device=device)
-    inputs = [args, wp.vec3(*point), wp.vec3(*normal), SIDE, slope]
-    wp.launch(rim_kernel, SIDE * SIDE, inputs, device=device)
-    mean: Float64Array = slope.numpy().astype(np.float64).mean(axis=0)
-    return mean
+    inputs = [args, wp.vec3(*point), wp.vec3(*normal), SIDE]
+    (slope,) = launch(rim_kernel, SIDE * SIDE, inputs, wp.vec3, device=device)
+    return np.asarray(slope.mean(axis=0))
 
 
 @pytest.mark.parametrize("lamp", [SPHERE, RECTANGLE], ids=["sphere", "rectangle"])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import launch, upload
 from warpir.kernels.lamps.solid_angle import (
     lamp_along,
     lamp_point,
@@ -87,17 +88,20 @@ def own_kernel(
     distance[i] = out.distance
 
 
-def launch(kernel: wp.Kernel, lamps: list[Lamp], p: np.ndarray, given: np.ndarray, device: str):
+OUTPUTS = {
+    "sample_kernel": (wp.vec3, float, float, wp.vec3),
+    "along_kernel": (float, float),
+    "own_kernel": (wp.vec3, float, float),
+}
+
+
+def seen(
+    kernel: wp.Kernel, lamps: list[Lamp], p: np.ndarray, given: np.ndarray, device: str
+) -> list[np.ndarray]:
     """Return what a kernel writes for one point: directions, densities, distances."""
     args = lamp_args(lamps, np.zeros(3), wp.get_device(device))
-    count = len(given)
-    source = wp.array(given.astype(np.float32), dtype=wp.vec3, device=device)
-    kinds = {"along": (float, float), "own": (wp.vec3, float, float)}
-    types = kinds.get(kernel.key.split("_")[0], (wp.vec3, float, float, wp.vec3))
-    out = [wp.zeros(count, dtype=t, device=device) for t in types]
-    inputs = [args, wp.vec3(*p.astype(np.float32)), source]
-    wp.launch(kernel, dim=count, inputs=inputs, outputs=out, device=device)
-    return [a.numpy().astype(np.float64) for a in out]
+    inputs = [args, wp.vec3(*p.astype(np.float32)), upload(given, wp.vec3, device)]
+    return launch(kernel, len(given), inputs, *OUTPUTS[kernel.key], device=device)
 
 
 def numbers(rng: np.random.Generator, count: int = SAMPLE_COUNT) -> np.ndarray:
@@ -143,7 +147,7 @@ def test_lamps_samples_give_the_closed_irradiance(
 ) -> None:
     """Mean of cos / pdf; 65 536 stratified directions of a bounded cosine."""
     for p in POINTS:
-        wi, pdf, _, radiance = launch(sample_kernel, [lamp], p, numbers(rng), device)
+        wi, pdf, _, radiance = seen(sample_kernel, [lamp], p, numbers(rng), device)
         for n in NORMALS:
             expected = float(irradiance(lamp, p, n)[0])
             weight = np.where(pdf > 0.0, np.maximum(wi @ n, 0.0) / np.maximum(pdf, 1e-30), 0.0)
@@ -154,7 +158,7 @@ def test_lamps_samples_give_the_closed_irradiance(
 
 def test_lamps_light_what_is_inside_from_all_sides(device: str, rng: np.random.Generator) -> None:
     for p in INSIDE:
-        wi, pdf, distance, _ = launch(sample_kernel, [SPHERE], p, numbers(rng), device)
+        wi, pdf, distance, _ = seen(sample_kernel, [SPHERE], p, numbers(rng), device)
         np.testing.assert_allclose(pdf, 0.25 / np.pi, rtol=1e-6)
         end = p + wi * distance[:, None]
         reach = np.linalg.norm(end - SPHERE.center, axis=1)
@@ -170,10 +174,10 @@ def test_lamps_rays_meet_what_is_drawn(lamp: Lamp, device: str, rng: np.random.G
     """Both techniques agree on density and distance, so their weights add up to 1."""
     for p in [*POINTS, *(INSIDE if lamp is SPHERE else [])]:
         u = numbers(rng, 4096)
-        wi, pdf, distance = launch(own_kernel, [lamp], p, u, device)
+        wi, pdf, distance = seen(own_kernel, [lamp], p, u, device)
         if not pdf.any():
             continue
-        met_pdf, met_distance = launch(along_kernel, [lamp], p, wi, device)
+        met_pdf, met_distance = seen(along_kernel, [lamp], p, wi, device)
         met = met_pdf > 0.0
         assert met.mean() > 0.998  # all but a few of the lamp's edge
         np.testing.assert_allclose(met_pdf[met], pdf[met], rtol=1e-4)
@@ -187,7 +191,7 @@ def test_lamps_density_integrates_to_one(lamp: Lamp, device: str, rng: np.random
     r = np.sqrt(1.0 - z * z)
     wi = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
     for p in POINTS[[0, 3]]:
-        pdf, _ = launch(along_kernel, [lamp], p, wi, device)
+        pdf, _ = seen(along_kernel, [lamp], p, wi, device)
         if not pdf.any():
             continue
         values = 4.0 * np.pi * pdf
@@ -202,7 +206,7 @@ def test_lamps_of_many_add_up(device: str, rng: np.random.Generator) -> None:
     lamps: list[Lamp] = [black, SPHERE, dim, RECTANGLE]
     p, n = np.array([0.0, 0.0, 0.4]), NORMALS[0]
     expected = sum(irradiance(lamp, p, n) for lamp in lamps)
-    wi, pdf, _, radiance = launch(sample_kernel, lamps, p, numbers(rng), device)
+    wi, pdf, _, radiance = seen(sample_kernel, lamps, p, numbers(rng), device)
     found = radiance * (np.maximum(wi @ n, 0.0) / pdf)[:, None]
     error = found.std(axis=0) / np.sqrt(len(found))
     assert (np.abs(found.mean(axis=0) - expected) < 4.0 * error).all()
@@ -216,4 +220,4 @@ def test_lamps_that_are_black_or_turned_away_give_nothing(
     behind = np.array([0.3, 1.25, 1.5])
     for lamp, p in ((black, POINTS[0]), (away, behind), (RECTANGLE, np.array([0.3, 1.0, -3.0]))):
         assert irradiance(lamp, p, -NORMALS[3]).max() == 0.0
-        assert launch(sample_kernel, [lamp], p, numbers(rng, 64), device)[1].max() == 0.0
+        assert seen(sample_kernel, [lamp], p, numbers(rng, 64), device)[1].max() == 0.0

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import differentiate, launch, upload
 from tests import oracles as o
 from warpir.kernels.maths.latlong import (
     bilinear_tap,
@@ -52,17 +53,12 @@ def lookup_kernel(
 
 
 def to_uv(d: np.ndarray, device: str) -> np.ndarray:
-    out = wp.zeros(len(d), dtype=wp.vec2, device=device)
-    source = wp.array(d.astype(np.float32), dtype=wp.vec3, device=device)
-    wp.launch(uv_kernel, len(d), inputs=[source], outputs=[out], device=device)
-    return out.numpy().astype(np.float64)
+    return launch(uv_kernel, len(d), [upload(d, wp.vec3, device)], wp.vec2, device=device)[0]
 
 
 def to_direction(uv: np.ndarray, device: str) -> np.ndarray:
-    out = wp.zeros(len(uv), dtype=wp.vec3, device=device)
-    source = wp.array(uv.astype(np.float32), dtype=wp.vec2, device=device)
-    wp.launch(direction_kernel, len(uv), inputs=[source], outputs=[out], device=device)
-    return out.numpy().astype(np.float64)
+    inputs = [upload(uv, wp.vec2, device)]
+    return launch(direction_kernel, len(uv), inputs, wp.vec3, device=device)[0]
 
 
 def wrapped(difference: np.ndarray) -> np.ndarray:
@@ -140,25 +136,13 @@ def test_lookup_matches_oracle(
     """Bilinear, texel centres at +0.5, wrapped in longitude, clamped in latitude."""
     texels = rng.random((height, width, 3), dtype=np.float32)
     uv = edge_uv(rng)
-    radiance = wp.zeros(len(uv), dtype=wp.vec3, device=device)
-    value = wp.zeros(len(uv), dtype=float, device=device)
-    wp.launch(
-        lookup_kernel,
-        len(uv),
-        inputs=[
-            wp.array(uv, dtype=wp.vec2, device=device),
-            height,
-            width,
-            wp.array(texels, dtype=wp.vec3, device=device),
-            wp.array(np.ascontiguousarray(texels[..., 1]), dtype=float, device=device),
-        ],
-        outputs=[radiance, value],
-        device=device,
-    )
+    maps = upload(texels, wp.vec3, device), upload(texels[..., 1], float, device)
+    inputs = [upload(uv, wp.vec2, device), height, width, *maps]
+    radiance, value = launch(lookup_kernel, len(uv), inputs, wp.vec3, float, device=device)
     expected = o.bilinear_lookup(texels, uv)
     tolerance = ADJOINT + WEIGHT_ULPS * max(height, width) * 2.0**-24
-    assert radiance.numpy() == pytest.approx(expected, abs=tolerance)
-    assert value.numpy() == pytest.approx(expected[:, 1], abs=tolerance)
+    assert radiance == pytest.approx(expected, abs=tolerance)
+    assert value == pytest.approx(expected[:, 1], abs=tolerance)
 
 
 @pytest.mark.parametrize("height, width", MAP_SIZES)
@@ -168,21 +152,12 @@ def test_lookup_adjoint_has_the_same_weights(
     """``<A texels, y> = <texels, A^T y>``, and ``A^T y`` scatters the oracle's four weights."""
     texels = rng.random((height, width, 3), dtype=np.float32)
     uv = edge_uv(rng)
-    source = wp.array(texels, dtype=wp.vec3, device=device, requires_grad=True)
-    scalar = wp.zeros((height, width), dtype=float, device=device)
-    radiance = wp.zeros(len(uv), dtype=wp.vec3, device=device, requires_grad=True)
-    value = wp.zeros(len(uv), dtype=float, device=device)
     y = rng.normal(size=(len(uv), 3)).astype(np.float32)
-    with wp.Tape() as tape:
-        wp.launch(
-            lookup_kernel,
-            len(uv),
-            inputs=[wp.array(uv, dtype=wp.vec2, device=device), height, width, source, scalar],
-            outputs=[radiance, value],
-            device=device,
-        )
-    tape.backward(grads={radiance: wp.array(y, dtype=wp.vec3, device=device)})
-    adjoint = source.grad.numpy().astype(np.float64)
+    maps = upload(texels, wp.vec3, device, True), upload(np.zeros((height, width)), float, device)
+    inputs = [upload(uv, wp.vec2, device), height, width, *maps]
+    (radiance, _), (adjoint,) = differentiate(
+        lookup_kernel, inputs, y, wp.vec3, float, device=device
+    )
     rows, columns, weights = o.bilinear_weights(uv, height, width)
     expected = np.zeros((height, width, 3))
     np.add.at(expected, (rows, columns), weights[..., None] * y[:, None, :])
@@ -192,5 +167,5 @@ def test_lookup_adjoint_has_the_same_weights(
     bound = touched * (ADJOINT + WEIGHT_ULPS * max(height, width) * 2.0**-24)
     assert np.all(np.abs(adjoint - expected) <= bound)
     scale = float(np.abs(y).sum())
-    forward = np.sum(radiance.numpy().astype(np.float64) * y)
+    forward = np.sum(radiance * y)
     assert forward == pytest.approx(np.sum(adjoint * texels), abs=ADJOINT * scale)

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
+from benchmarks.stability.case import launch
 from tests.statistics import SIGNIFICANCE, chi_square_counts, sidak
 from warpir.kernels.maths.rng import pixel_seed, sobol_pair, sobol_point, sobol_shuffled
 
@@ -50,9 +51,8 @@ def draw(
         wp.array(np.ascontiguousarray(a, np.int32).ravel(), dtype=int, device=device)
         for a in (index, seed, pixel, pair)
     ]
-    out = wp.zeros(index.size, dtype=wp.vec2, device=device)
-    wp.launch(sobol_kernel, index.size, inputs=arrays, outputs=[out], device=device)
-    return out.numpy().astype(np.float64).reshape(*index.shape, 2)
+    (u,) = launch(sobol_kernel, index.size, arrays, wp.vec2, device=device)
+    return u.reshape(*index.shape, 2)
 
 
 def assert_is_net(u: np.ndarray, k: int) -> None:

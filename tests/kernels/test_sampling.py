@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.stability.case import upload
+from benchmarks.stability.case import launch, upload
 from benchmarks.stability.maps import eval_kernel, sample_kernel
 from tests import oracles as o
 from tests.statistics import ChiSquare, chi_square, graded_edges
@@ -65,6 +65,16 @@ def lobe_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.ar
     wi[i] = lobe_sample(u[i], axis, sharpness)
 
 
+def heuristic(a: np.ndarray, b: np.ndarray, device: str) -> np.ndarray:
+    inputs = [upload(m, float, device) for m in (a, b)]
+    return launch(heuristic_kernel, len(a), inputs, float, device=device)[0]
+
+
+def draw_cosine(rng: np.random.Generator, device: str) -> np.ndarray:
+    inputs = [uniform2(rng, SAMPLE_COUNT, device)]
+    return launch(cosine_kernel, SAMPLE_COUNT, inputs, wp.vec3, device=device)[0]
+
+
 def uniform2(rng: np.random.Generator, count: int, device: str) -> wp.array:
     return wp.array(rng.random((count, 2), dtype=np.float32), dtype=wp.vec2, device=device)
 
@@ -72,27 +82,14 @@ def uniform2(rng: np.random.Generator, count: int, device: str) -> wp.array:
 def draw_light(
     light: LightArgs, rng: np.random.Generator, device: str, count: int = SAMPLE_COUNT
 ) -> np.ndarray:
-    wi = wp.zeros(count, dtype=wp.vec3, device=device)
-    wp.launch(
-        sample_kernel,
-        count,
-        inputs=[light, uniform2(rng, count, device)],
-        outputs=[wi],
-        device=device,
-    )
-    return wi.numpy().astype(np.float64)
+    inputs = [light, uniform2(rng, count, device)]
+    return launch(sample_kernel, count, inputs, wp.vec3, device=device)[0]
 
 
 def eval_light(light: LightArgs, wi: np.ndarray, device: str) -> tuple[np.ndarray, np.ndarray]:
-    count = wi.size // 3
-    radiance = wp.zeros(count, dtype=wp.vec3, device=device)
-    pdf = wp.zeros(count, dtype=float, device=device)
-    source = upload(wi.reshape(-1, 3), wp.vec3, device)
-    wp.launch(eval_kernel, count, inputs=[light, source], outputs=[radiance, pdf], device=device)
-    return (
-        radiance.numpy().astype(np.float64).reshape(wi.shape),
-        pdf.numpy().astype(np.float64).reshape(wi.shape[:-1]),
-    )
+    inputs = [light, upload(wi.reshape(-1, 3), wp.vec3, device)]
+    radiance, pdf = launch(eval_kernel, wi.size // 3, inputs, wp.vec3, float, device=device)
+    return radiance.reshape(wi.shape), pdf.reshape(wi.shape[:-1])
 
 
 def some_lobes() -> Lobes:
@@ -131,15 +128,8 @@ def test_frame_is_orthonormal_and_right_handed(device: str, rng: np.random.Gener
         ]
     )
     v = o.normalize(rng.normal(size=(5000, 3)))
-    out = [wp.zeros(len(n), dtype=wp.vec3, device=device) for _ in range(4)]
-    wp.launch(
-        frame_kernel,
-        len(n),
-        inputs=[upload(n, wp.vec3, device), upload(v, wp.vec3, device)],
-        outputs=out,
-        device=device,
-    )
-    x, y, local, back = (a.numpy().astype(np.float64) for a in out)
+    inputs = [upload(n, wp.vec3, device), upload(v, wp.vec3, device)]
+    x, y, local, back = launch(frame_kernel, len(n), inputs, *[wp.vec3] * 4, device=device)
     frame = np.stack([x, y, n], axis=-1)
     # Next to -Z the construction divides by 1 + z, so an ulp of z costs about 1e-6.
     assert np.abs(np.swapaxes(frame, 1, 2) @ frame - np.eye(3)).max() < 2e-6
@@ -155,19 +145,12 @@ def test_power_heuristic(device: str) -> None:
     """``a^2 / (a^2 + b^2)`` (Veach 1997), without overflow; weights of a pair sum to 1."""
     values = np.array([0.0, 1e-30, 1e-6, 0.3, 1.0, 7.0, 1e8, 1e25, 3e38], np.float32)
     a, b = (m.ravel() for m in np.meshgrid(values, values))
-
-    def launch(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        weight = wp.zeros(len(p), dtype=float, device=device)
-        arrays = [wp.array(m, dtype=float, device=device) for m in (p, q)]
-        wp.launch(heuristic_kernel, len(p), inputs=arrays, outputs=[weight], device=device)
-        return weight.numpy().astype(np.float64)
-
     a64, b64 = a.astype(np.float64), b.astype(np.float64)
     used = (a > 0) | (b > 0)
     expected = np.divide(a64**2, a64**2 + b64**2, out=np.zeros_like(a64), where=used)
-    weight = launch(a, b)
+    weight = heuristic(a, b, device)
     assert weight == pytest.approx(expected, abs=1e-6)
-    assert (weight + launch(b, a))[used] == pytest.approx(1.0, abs=1e-6)
+    assert (weight + heuristic(b, a, device))[used] == pytest.approx(1.0, abs=1e-6)
 
 
 # ------------------------------------------------------------------------------ samplers
@@ -175,15 +158,7 @@ def test_power_heuristic(device: str) -> None:
 
 def test_cosine_sample(device: str, rng: np.random.Generator) -> None:
     """Directions follow ``cos / pi`` and never point below the surface."""
-    wi = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
-    wp.launch(
-        cosine_kernel,
-        SAMPLE_COUNT,
-        inputs=[uniform2(rng, SAMPLE_COUNT, device)],
-        outputs=[wi],
-        device=device,
-    )
-    d = wi.numpy().astype(np.float64)
+    d = draw_cosine(rng, device)
     assert np.abs(np.linalg.norm(d, axis=-1) - 1.0).max() < UNIT_ABS
     theta = np.linspace(0.0, np.pi, 41)
     verdict = chi_square(d, o.cosine_pdf, theta, np.linspace(-np.pi, np.pi, 33))
@@ -211,11 +186,8 @@ def lobe_verdict(wi: np.ndarray, axis: np.ndarray, sharpness: float, case_count:
 def draw_lobe(
     axis: np.ndarray, sharpness: float, rng: np.random.Generator, device: str, count: int
 ) -> np.ndarray:
-    wi = wp.zeros(count, dtype=wp.vec3, device=device)
-    u = uniform2(rng, count, device)
-    inputs = [u, wp.vec3(*map(float, axis)), sharpness]
-    wp.launch(lobe_kernel, count, inputs=inputs, outputs=[wi], device=device)
-    return wi.numpy().astype(np.float64)
+    inputs = [uniform2(rng, count, device), wp.vec3(*map(float, axis)), sharpness]
+    return launch(lobe_kernel, count, inputs, wp.vec3, device=device)[0]
 
 
 @pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
@@ -401,25 +373,15 @@ def test_mis_irradiance_is_unbiased(device: str, rng: np.random.Generator, kind:
         truth += np.einsum("t,tpc,p->c", weight_t, value, weight_p)
 
     from_light = draw_light(light, rng, device)
-    wi = wp.zeros(SAMPLE_COUNT, dtype=wp.vec3, device=device)
-    wp.launch(
-        cosine_kernel,
-        SAMPLE_COUNT,
-        inputs=[uniform2(rng, SAMPLE_COUNT, device)],
-        outputs=[wi],
-        device=device,
-    )
-    from_cosine = wi.numpy().astype(np.float64) @ o.frame_of(n).T
+    from_cosine = draw_cosine(rng, device) @ o.frame_of(n).T
     total = np.zeros((SAMPLE_COUNT, 3))
     for d, is_light in ((from_light, True), (from_cosine, False)):
         radiance, pdf_light = eval_light(light, d, device)
         cos = np.maximum(0.0, d @ n)
         pdf_cosine = cos / np.pi
         own, other = (pdf_light, pdf_cosine) if is_light else (pdf_cosine, pdf_light)
-        weight = wp.zeros(SAMPLE_COUNT, dtype=float, device=device)
-        arrays = [wp.array(m.astype(np.float32), dtype=float, device=device) for m in (own, other)]
-        wp.launch(heuristic_kernel, SAMPLE_COUNT, inputs=arrays, outputs=[weight], device=device)
-        factor = np.divide(weight.numpy() * cos, own, out=np.zeros(SAMPLE_COUNT), where=own > 0)
+        weight = heuristic(own, other, device)
+        factor = np.divide(weight * cos, own, out=np.zeros(SAMPLE_COUNT), where=own > 0)
         total += radiance * factor[:, None]
     error = total.std(axis=0) / np.sqrt(SAMPLE_COUNT)
     assert np.all(np.abs(total.mean(axis=0) - truth) < Z_MAX * error), (

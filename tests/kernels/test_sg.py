@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.stability.case import upload
+from benchmarks.stability.case import launch, upload
 from tests import oracles as o
 from warpir.kernels.maths.sg import sg_shape
 
@@ -25,8 +25,7 @@ def test_sg_shape(device: str, rng: np.random.Generator, sharpness: float) -> No
     # Directions out to an exponent of 20, as far as the sphere goes.
     cos = 1.0 - np.minimum(rng.uniform(0.0, 20.0, 20000) / sharpness, 2.0)
     v = (o.spherical(cos, rng.uniform(0, 2 * np.pi, 20000)) @ o.frame_of(axis).T).astype(np.float32)
-    out = wp.zeros(len(v), dtype=float, device=device)
     inputs = [upload(v, wp.vec3, device), wp.vec3(*map(float, axis)), sharpness]
-    wp.launch(shape_kernel, len(v), inputs=inputs, outputs=[out], device=device)
+    (shape,) = launch(shape_kernel, len(v), inputs, float, device=device)
     expected = np.exp(-sharpness * o.one_minus_cos(v, axis))
-    np.testing.assert_allclose(out.numpy(), expected, rtol=VALUE_RTOL)
+    np.testing.assert_allclose(shape, expected, rtol=VALUE_RTOL)

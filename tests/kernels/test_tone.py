@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.stability.case import differentiate, launch, upload
 from benchmarks.stability.tone import reinhard_kernel
 from tests import oracles as o
 from tests.statistics import central_differences, compare_gradients, warp_agrees
@@ -44,19 +45,16 @@ def ratio_kernel(
     y[i] = ratio_curve(x[i], 0, knot_x, knot_y, knot_slope, bin_count)
 
 
-def upload(values: np.ndarray, device: str, requires_grad: bool = False) -> wp.array:
-    values = np.ascontiguousarray(values, np.float32)
-    return wp.array(values, dtype=float, device=device, requires_grad=requires_grad)
+def floats(values: np.typing.ArrayLike, device: str, grad: bool = False) -> wp.array:
+    return upload(values, float, device, grad)
 
 
 def apply_curve(
     x: np.ndarray, curve: np.ndarray, knots: tuple[np.ndarray, ...], device: str
 ) -> np.ndarray:
-    out = wp.zeros(len(x), dtype=float, device=device)
     index = wp.array(np.asarray(curve, np.int32), dtype=int, device=device)
-    inputs = [upload(x, device), index, *(upload(k, device) for k in knots), knots[0].shape[1] - 1]
-    wp.launch(curve_kernel, len(x), inputs=inputs, outputs=[out], device=device)
-    return out.numpy().astype(np.float64)
+    inputs = [floats(x, device), index, *(floats(k, device) for k in knots), knots[0].shape[1] - 1]
+    return launch(curve_kernel, len(x), inputs, float, device=device)[0]
 
 
 def float32_knots(raw: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -119,14 +117,10 @@ def curve_gradients(
     x: np.ndarray, curve: np.ndarray, knots: tuple[np.ndarray, ...], y: np.ndarray, device: str
 ) -> list[np.ndarray]:
     """Return gradients of ``sum(y * curve(x))`` by ``x`` and the three knot arrays."""
-    arrays = [upload(x, device, True), *(upload(k, device, True) for k in knots)]
+    arrays = [floats(a, device, True) for a in (x, *knots)]
     index = wp.array(np.asarray(curve, np.int32), dtype=int, device=device)
-    out = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        inputs = [arrays[0], index, *arrays[1:], knots[0].shape[1] - 1]
-        wp.launch(curve_kernel, len(x), inputs=inputs, outputs=[out], device=device)
-    tape.backward(grads={out: upload(y, device)})
-    return [a.grad.numpy().astype(np.float64) for a in arrays]
+    inputs = [arrays[0], index, *arrays[1:], knots[0].shape[1] - 1]
+    return differentiate(curve_kernel, inputs, y, float, device=device)[1]
 
 
 def test_curve_gradient(device: str, rng: np.random.Generator) -> None:
@@ -174,7 +168,7 @@ def test_curve_gradcheck(device: str, rng: np.random.Generator) -> None:
     x = 0.5 * (knots[0][0, 1:] + knots[0][0, :-1])
     index = wp.zeros(5, dtype=int, device=device)
     out = wp.zeros(5, dtype=float, device=device, requires_grad=True)
-    inputs = [upload(x, device, True), index, *(upload(k, device, True) for k in knots), 5]
+    inputs = [floats(x, device, True), index, *(floats(k, device, True) for k in knots), 5]
     assert warp_agrees(curve_kernel, inputs, out)
 
 
@@ -182,40 +176,34 @@ def test_ratio_curve_goes_on_straight(device: str, rng: np.random.Generator) -> 
     """Beyond 1 the last slope goes on, in value and gradient; below, it is the curve itself."""
     knots = float32_knots(rng.normal(scale=0.8, size=(1, 16)))
     below, beyond = np.array([0.0, 0.3, 0.9, 1.0]), np.array([1.0 + 1e-3, 1.5, 40.0])
-    x = upload(np.concatenate([below, beyond]), device, True)
-    arrays = [upload(k, device, True) for k in knots]
-    y = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        wp.launch(ratio_kernel, len(x), inputs=[x, *arrays, 5], outputs=[y], device=device)
-    tape.backward(grads={y: upload(np.ones(len(x)), device)})
+    inputs = [floats(a, device, True) for a in (np.concatenate([below, beyond]), *knots)]
+    (y,), (d_x, _, _, d_slope) = differentiate(
+        ratio_kernel, [*inputs, 5], np.ones(len(inputs[0])), float, device=device
+    )
     last = float(knots[2][0, -1])
     plain = apply_curve(below, np.zeros(4), knots, device)
-    np.testing.assert_array_equal(y.numpy()[:4], plain)
-    np.testing.assert_allclose(y.numpy()[4:], 1.0 + last * (beyond - 1.0), rtol=1e-6)
-    np.testing.assert_allclose(x.grad.numpy()[4:], last, rtol=1e-6)
+    np.testing.assert_array_equal(y[:4], plain)
+    np.testing.assert_allclose(y[4:], 1.0 + last * (beyond - 1.0), rtol=1e-6)
+    np.testing.assert_allclose(d_x[4:], last, rtol=1e-6)
     at_one = curve_gradients(below, np.zeros(4), knots, np.ones(4), device)[3]
-    d_last = arrays[2].grad.numpy()[0, -1] - at_one[0, -1]
+    d_last = d_slope[0, -1] - at_one[0, -1]
     assert d_last == pytest.approx((beyond - 1.0).sum(), rel=1e-5)
 
 
 def test_reinhard(device: str) -> None:
     """``x / (1 + x)`` for radiance from 0 to suns; finite and at most 1 beyond (2002, eq. 3)."""
     x = np.array([0.0, 1e-8, 0.18, 1.0, 16.0, 1e4, 1e9, 1e30, 3e38], np.float32)
-    out = wp.zeros(len(x), dtype=float, device=device)
-    wp.launch(reinhard_kernel, len(x), inputs=[upload(x, device)], outputs=[out], device=device)
-    np.testing.assert_allclose(out.numpy(), o.reinhard(x), rtol=1e-6)
+    (y,) = launch(reinhard_kernel, len(x), [floats(x, device)], float, device=device)
+    np.testing.assert_allclose(y, o.reinhard(x), rtol=1e-6)
 
 
 def test_reinhard_gradient(device: str) -> None:
     """The adjoint is ``1 / (1 + x)^2``, for suns too; none below 0."""
     x = np.array([-1.0, 0.0, 1e-6, 0.18, 1.0, 16.0, 1e3, 1e5, 1e8, 1e15], np.float32)
-    source = upload(x, device, True)
-    out = wp.zeros(len(x), dtype=float, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        wp.launch(reinhard_kernel, len(x), inputs=[source], outputs=[out], device=device)
-    tape.backward(grads={out: upload(np.ones(len(x)), device)})
+    inputs = [floats(x, device, True)]
+    _, (d_x,) = differentiate(reinhard_kernel, inputs, np.ones(len(x)), float, device=device)
     expected = np.append(0.0, 1.0 / (1.0 + x[1:].astype(np.float64)) ** 2)
-    np.testing.assert_allclose(source.grad.numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(d_x, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("x", [[0, 0.5, 0.5, 1], [0, 0.5, 1, 1], [0, 0, 0.5, 1], [0, 0.3, 0.7, 1]])
