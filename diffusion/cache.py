@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 
 def content_key(*contents: object) -> str:

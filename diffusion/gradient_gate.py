@@ -6,17 +6,15 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from warpir.diffusion.crop import box_of
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.schedule import time_range
 from warpir.diffusion.settings import GuidanceSettings
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 NORM_WINDOW = 101
 """Number of past steps whose median norm defines an outlier."""

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from warpir.diffusion.settings import PREDICTION_TYPES
-
 TIME_LIMIT = 0.98
 """Latest time that is used: a schedule rescaled to zero terminal SNR has no signal at its end."""
 
@@ -24,11 +22,6 @@ class NoiseSchedule:
     """alpha-bar by timestep, float64 on the CPU, shape [T]."""
     prediction_type: str
     """``epsilon``, ``v_prediction`` or ``sample``."""
-
-    def __post_init__(self) -> None:
-        """Check the prediction type."""
-        if self.prediction_type not in PREDICTION_TYPES:
-            raise ValueError(f"prediction_type: unknown (found {self.prediction_type!r})")
 
     def timestep(self, t: Tensor) -> Tensor:
         """Return the integer timesteps of times in [0, 1], same shape."""
@@ -76,14 +69,9 @@ def weight(name: str, alpha: Tensor, sigma: Tensor, literal_alpha: bool = False)
         alpha: a, any shape.
         sigma: s, same shape.
         literal_alpha: Multiply by ``a``, the factor of dz_t/dphi in DiPIR's eq. 7 and 8.
-
-    Raises:
-        ValueError: The name is unknown.
     """
-    weights = {"sigma2": sigma * sigma, "sigma": sigma, "uniform": torch.ones_like(sigma)}
-    if name not in weights:
-        raise ValueError(f"weight: {', '.join(weights)} (found {name!r})")
-    return weights[name] * alpha if literal_alpha else weights[name]
+    chosen = {"sigma2": sigma * sigma, "sigma": sigma, "uniform": torch.ones_like(sigma)}[name]
+    return chosen * alpha if literal_alpha else chosen
 
 
 def time_range(

@@ -71,11 +71,7 @@ def find_model(model: str | None, allow_download: bool, allow_pickle: bool = Fal
 
 
 def _download(model: str, allow_pickle: bool) -> Path:
-    """Fetch what is read of a hub repository, and nothing else.
-
-    Raises:
-        ModelError: The repository cannot be reached, or is closed.
-    """
+    """Fetch what is read of a hub repository, and nothing else."""
     from huggingface_hub import HfApi, snapshot_download
 
     try:

@@ -96,11 +96,7 @@ def _load(
     device: torch.device,
     **options: Any,
 ) -> Any:
-    """Load one part's network, with exactly the weights it needs, all of them finite.
-
-    Raises:
-        ModelError: The weights are not the network's, or not finite in this precision.
-    """
+    """Load one part's network, with exactly the weights it needs, all finite in its precision."""
     path, weights = folder.path / part, folder.weights[part]
     with _one_sentence(str(path)):
         network, loaded = kind.from_pretrained(
@@ -124,11 +120,7 @@ def _load(
 
 
 def _load_tokenizer(folder: ModelFolder, vocabulary: int) -> CLIPTokenizer:
-    """Load the tokenizer.
-
-    Raises:
-        ModelError: It cannot be read, or has ids that the text encoder has not.
-    """
+    """Load the tokenizer, whose ids the text encoder must have."""
     path = folder.path / "tokenizer"
     with _one_sentence(str(path)):
         tokenizer = CLIPTokenizer.from_pretrained(
@@ -141,11 +133,7 @@ def _load_tokenizer(folder: ModelFolder, vocabulary: int) -> CLIPTokenizer:
 
 
 def _noise_schedule(config: dict[str, Any]) -> NoiseSchedule:
-    """Return the schedule of a scheduler's configuration, as diffusers computes it.
-
-    Raises:
-        ModelError: It is none of the kinds that Stable Diffusion has.
-    """
+    """Return the schedule of a scheduler's configuration, as diffusers computes it."""
     where = "scheduler/scheduler_config.json"
     kind = config.get("prediction_type", "epsilon")
     count = config.get("num_train_timesteps", 1000)
@@ -159,11 +147,7 @@ def _noise_schedule(config: dict[str, Any]) -> NoiseSchedule:
 
 @contextmanager
 def _one_sentence(where: str) -> Iterator[None]:
-    """Turn whatever a library raises about a file into one `ModelError`, and hush its log.
-
-    Raises:
-        ModelError: Something was raised that is no lack of memory.
-    """
+    """Turn what a library raises, but a lack of memory, into one `ModelError`; hush its log."""
     logs = [logging.getLogger(name) for name in ("diffusers", "transformers")]
     levels = [log.level for log in logs]
     for log in logs:

@@ -142,11 +142,7 @@ class StableDiffusion:
                 f"last that is read"
             )
         padded = self.tokenizer(
-            prompt,
-            padding="max_length",
-            max_length=length,
-            truncation=True,
-            return_tensors="pt",
+            prompt, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
         ).input_ids
         hidden: Tensor = self.text_encoder(padded.to(self.device))[0]
         return hidden[0].float()
@@ -161,10 +157,8 @@ class StableDiffusion:
         """Return latents, float32, shape [B, 4, h, w]: the posterior's mean, scaled.
 
         Differentiable. With a VAE in fp16, sum the loss over the latents rather than averaging it:
-        a mean's small gradients underflow on their way back.
-
-        Args:
-            image: Display-encoded, in [0, 1], shape [B, 3, resolution, resolution].
+        a mean's small gradients underflow on their way back. The image is display-encoded, in
+        [0, 1], shape [B, 3, resolution, resolution].
         """
         pixels = (2.0 * image - 1.0).to(self.device, self.vae.dtype)
         mean_of: Callable[[Tensor], tuple[Tensor, ...]] = self._mean
@@ -284,12 +278,9 @@ class StableDiffusion:
 
     @torch.no_grad()
     def self_check(self, image: Tensor, prompt: str, seed: int = 0) -> dict[str, float]:
-        """Return figures that tell a working model from a broken one, for a photo.
+        """Return figures that tell a working model from a broken one, for a photo of the prompt.
 
-        Args:
-            image: Display-encoded, in [0, 1], shape [1, 3, resolution, resolution].
-            prompt: What it shows.
-            seed: Of the noise.
+        The image is as for `encode`; the seed is that of the noise.
 
         Returns:
             ``noise_error``: mean squared error of the noise at time 0.5; a trained model stays well
@@ -323,9 +314,8 @@ class StableDiffusion:
     def precision_check(self, difference: Callable[[], Tensor]) -> float:
         """Return the cosine between a difference of predictions as computed here and in fp32.
 
-        Args:
-            difference: Predicts and subtracts, such as guidance does with its own prompts and
-                adapters; called twice, with all else equal. 1 where the UNet is in fp32 anyway.
+        It predicts and subtracts, as guidance does with its own prompts and adapters, and is called
+        twice with all else equal. 1 where the UNet is in fp32 anyway.
         """
         if self.unet_dtype is torch.float32:
             return 1.0
@@ -363,11 +353,9 @@ class StableDiffusion:
         return self.precision != before
 
     def finite(self, compute: Callable[[], Tensor], what: str) -> Tensor:
-        """Return what is computed; in fp32 and from now on so, where half precision overflows.
+        """Return what is computed; in fp32 from now on if half precision overflows.
 
-        Args:
-            compute: Called again in fp32.
-            what: What it computes, for a person.
+        A person reads ``what`` it is.
 
         Raises:
             NonFiniteError: It is not finite in fp32 either.

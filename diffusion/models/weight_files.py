@@ -165,9 +165,6 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
     """Check the header and the values of one of our networks that see a photo.
 
     Without a path it is the one of that name that is part of the package.
-
-    Raises:
-        ModelError: Not there, damaged, or something else.
     """
     shipped = SHIPPED / f"{name}.safetensors"
     file = read_header(path or shipped)
@@ -196,9 +193,6 @@ def _check_built(file: WeightFile, config: Mapping[str, Any]) -> None:
     """Check that the weights are of a network of these sizes, by their names and widths.
 
     The answers' own sizes are checked when the weights are read.
-
-    Raises:
-        ModelError: They are not.
     """
     members = {name.split(".")[1] for name in file.shapes if name.startswith("members.")}
     fine, middle = config["blocks"]
@@ -217,11 +211,7 @@ def _check_built(file: WeightFile, config: Mapping[str, Any]) -> None:
 
 
 def _check_sizes(where: str, config: Mapping[str, Any], sizes: Sizes) -> None:
-    """Check what a header says of its network, before one is built.
-
-    Raises:
-        ModelError: A number is missing, too many, out of range, or a list is none.
-    """
+    """Check what a header says of its network, before one is built."""
     if set(config) != set(sizes):
         raise ModelError(where, "its header is damaged (other sizes of a network than expected)")
     for name, (fewest, most, kind, low, high) in sizes.items():
@@ -311,11 +301,7 @@ def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
 
 
 def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
-    """Check that the values of one of our networks are finite, and have the `values_hash` expected.
-
-    Raises:
-        ModelError: They are not, or there are too many.
-    """
+    """Check that one of our networks has not too many values, all finite, of this `values_hash`."""
     where, count = str(file.path), sum(map(math.prod, file.shapes.values()))
     if count > NUMBERS_MAX:
         raise ModelError(where, f"{count} weights (expected at most {NUMBERS_MAX})")
@@ -333,11 +319,7 @@ def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
 
 
 def _check_finite(file: WeightFile) -> None:
-    """Check the values of a file, in any kind of number that weights have.
-
-    Raises:
-        ModelError: Some are NaN or infinite.
-    """
+    """Check that a file's values are finite, in any kind of number that weights have."""
     for name, piece in _pieces(file):
         if file.kinds[name] in EXPONENTS:
             stored, bits = EXPONENTS[file.kinds[name]]
@@ -347,11 +329,7 @@ def _check_finite(file: WeightFile) -> None:
 
 
 def _pieces(file: WeightFile) -> Iterator[tuple[str, bytes]]:
-    """Yield what tensors hold, by name in order, in pieces of whole numbers: one at least of each.
-
-    Raises:
-        ModelError: The file cannot be read any more.
-    """
+    """Yield what tensors hold, by name in order, in pieces of whole numbers: at least one each."""
     try:
         with file.path.open("rb") as stream:
             start = 8 + int.from_bytes(stream.read(8), "little")

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -26,11 +25,9 @@ from warpir.core.atomic import write_file
 from warpir.core.cache import CACHE_BYTES, make_room
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.draws import seed_of
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.prompts import Prompts, draw_class_prompts
 from warpir.diffusion.settings import PersonalizeSettings
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 FORMAT = 1
 """Meaning of a stored picture; part of every key."""
@@ -124,17 +121,9 @@ def _made(
     settings: PersonalizeSettings,
 ) -> Tensor:
     """Return one batch of pictures by the unadapted model, uint8, shape [B, 3, R, R]."""
-
-    def made() -> Tensor:
-        return prior.sample(
-            texts,
-            seeds,
-            steps=settings.class_steps,
-            scale=settings.class_scale,
-            batch=settings.class_batch,
-        )
-
-    return to_bytes(prior.finite(made, "pictures of the class"))
+    steps, scale, batch = settings.class_steps, settings.class_scale, settings.class_batch
+    sample = partial(prior.sample, texts, seeds, steps=steps, scale=scale, batch=batch)
+    return to_bytes(prior.finite(sample, "pictures of the class"))
 
 
 def _read_kept(files: Sequence[Path], images: Tensor) -> tuple[set[int], list[str]]:
@@ -177,17 +166,13 @@ def encode_pictures(
     return torch.cat(latents)
 
 
-def _pixel_hash(pixels: bytes) -> str:
-    return hashlib.sha256(pixels).hexdigest()
-
-
 def _png(picture: Tensor, prompt: str, seed: int) -> bytes:
     """Return a PNG that names what it shows; [3, H, W] uint8."""
     pixels = np.ascontiguousarray(picture.permute(1, 2, 0).numpy())
     texts = PngImagePlugin.PngInfo()
     texts.add_itxt("prompt", prompt)
     texts.add_text("seed", str(seed))
-    texts.add_text("sha256", _pixel_hash(pixels.tobytes()))
+    texts.add_text("sha256", hashlib.sha256(pixels.tobytes()).hexdigest())
     file = io.BytesIO()
     # Fast rather than small: the model waits meanwhile.
     Image.fromarray(pixels).save(file, "PNG", pnginfo=texts, compress_level=1)
@@ -195,17 +180,13 @@ def _png(picture: Tensor, prompt: str, seed: int) -> bytes:
 
 
 def _read_png(path: Path, side: int) -> Tensor:
-    """Return a stored picture, uint8 [3, side, side].
-
-    Raises:
-        Exception: Pillow cannot read it, or it is not the picture that was stored.
-    """
+    """Return a stored picture, uint8 [3, side, side]; raise anything if it is not that."""
     with Image.open(path, formats=["PNG"]) as file:
         if file.size != (side, side):
             raise ValueError(f"found {file.size} pixels, expected {(side, side)}")
         pixels = np.array(file)
         # Decoders forgive a flipped bit in the pixels.
-        if _pixel_hash(pixels.tobytes()) != file.info.get("sha256"):
+        if hashlib.sha256(pixels.tobytes()).hexdigest() != file.info.get("sha256"):
             raise ValueError("its pixels were changed")
     with contextlib.suppress(OSError):  # a cache that is only read is one too
         os.utime(path)

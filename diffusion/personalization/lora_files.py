@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,11 +31,9 @@ from warpir.core.atomic import write_file
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import read_json
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.models.weight_files import beside_lora, check_lora, not_a_lora
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 HEADER_KEY = "lora_adapter_metadata"
 """Where diffusers keeps peft's configuration in a file's header."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from warpir.diffusion.draws import generator_of
 from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.lora_files import (
     Lora,
     install_lora,
@@ -21,9 +22,6 @@ from warpir.diffusion.personalization.lora_files import (
 )
 from warpir.diffusion.prior import BAD_STEPS_MAX, BadSteps, NonFiniteError
 from warpir.diffusion.settings import PersonalizeSettings
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 BETAS = (0.9, 0.999)
 """Of AdamW; as in diffusers' example of DreamBooth with a LoRA."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from warpir.core.cache import find_kept, seal
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.draws import generator_of
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.models.tensor_files import read_safetensors, serialize
 from warpir.diffusion.personalization.class_images import (
     ClassImages,
@@ -42,9 +43,6 @@ from warpir.diffusion.personalization.lora_files import (
 from warpir.diffusion.personalization.lora_training import LoraTraining
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 FORMAT = 1
 """Meaning of a stored LoRA; part of every key."""
@@ -226,11 +224,7 @@ def _train(
     report: Report | None,
     on_step: Callable[[LoraTraining], None] | None,
 ) -> None:
-    """Take the steps that are left; arguments as in `personalize`.
-
-    Raises:
-        NonFiniteError: The losses stay non-finite.
-    """
+    """Take the steps that are left; arguments and errors as in `personalize`."""
     prior, step_count = training.prior, training.settings.lora_steps
     update: Callable[[], None] = training.update
 

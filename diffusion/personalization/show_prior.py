@@ -10,20 +10,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.class_images import Report, to_bytes
 from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prompts import Prompts
 from warpir.diffusion.settings import PersonalizeSettings
-
-if TYPE_CHECKING:
-    from warpir.diffusion.models.stable_diffusion import StableDiffusion
 
 # Neither is part of the other: diffusers would look for the one among the weights of the other.
 WITH_CLASS, WITHOUT_CLASS = "scene", "no-class"
