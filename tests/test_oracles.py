@@ -384,13 +384,17 @@ def test_film_sums_airys_series() -> None:
         np.testing.assert_allclose(R12 + Rs + series, o.airy(R12, R23, delta), atol=1e-13)
 
 
-def sky_ratio(blocked: Callable[[np.ndarray], np.ndarray], count: int = 1500) -> float:
-    """Return the open share of a constant sky's irradiance on ``Y = 0``, midpoint rule."""
+def sky_directions(count: int = 1500) -> np.ndarray:
+    """Return directions above ``Y = 0`` of equal shares of its irradiance, midpoint rule."""
     cos2 = (np.arange(count) + 0.5) / count
     phi = 2 * np.pi * (np.arange(2 * count) + 0.5) / (2 * count)
     sin, cos = np.sqrt(1 - cos2)[:, None], np.sqrt(cos2)[:, None]
-    d = np.stack(np.broadcast_arrays(sin * np.cos(phi), cos, sin * np.sin(phi)), -1)
-    return float(1.0 - np.mean(blocked(d)))
+    return np.stack(np.broadcast_arrays(sin * np.cos(phi), cos, sin * np.sin(phi)), -1)
+
+
+def sky_ratio(blocked: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Return the open share of a constant sky's irradiance on ``Y = 0``."""
+    return float(1.0 - np.mean(blocked(sky_directions())))
 
 
 @pytest.mark.parametrize("x", [-3.0, -0.4, 0.0, 0.7, 2.5])
@@ -414,12 +418,7 @@ def test_half_plane_shadow_under_lobes() -> None:
 @pytest.mark.parametrize("sharpness, x", [(4.0, 0.2), (60.0, 0.55)])
 def test_half_plane_lobe_by_quadrature(sharpness: float, x: float) -> None:
     """The lune quadrature against a weighted count of directions."""
-    axis = o.normalize([-0.5, 1.0, 0.3])
-    count = 1500
-    cos2 = (np.arange(count) + 0.5) / count
-    phi = 2 * np.pi * (np.arange(2 * count) + 0.5) / (2 * count)
-    sin, cos = np.sqrt(1 - cos2)[:, None], np.sqrt(cos2)[:, None]
-    d = np.stack(np.broadcast_arrays(sin * np.cos(phi), cos, sin * np.sin(phi)), -1)
+    axis, d = o.normalize([-0.5, 1.0, 0.3]), sky_directions()
     lobe = np.exp(sharpness * (d @ axis - 1))
     value = np.sum(lobe * (x * d[..., 1] + d[..., 0] < 0)) / np.sum(lobe)
     assert o.half_plane_ratio_lobe(x, 1.0, axis, sharpness) == pytest.approx(value, abs=1e-3)

@@ -18,6 +18,8 @@ WORDS = ("scene", "style", "sks", "rendering")
 START, END = "<|startoftext|>", "<|endoftext|>"
 RESOLUTION = 64
 """Side of the pictures that the model judges [px]: a latent of 8 x 8."""
+ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
+"""Layers that a LoRA adapts by default."""
 
 
 def make_tiny_stable_diffusion(
@@ -87,6 +89,27 @@ def make_tiny_stable_diffusion(
     (folder / "tokenizer" / "tokenizer.json").unlink()
     write_tokenizer(folder / "tokenizer")
     return folder
+
+
+def add_lora(
+    prior: Any, name: str, seed: int, gain: float = 0.2, layers: tuple[str, ...] = ATTENTION
+) -> None:
+    """Add a LoRA to a loaded model that does something: peft starts B at zero."""
+    from peft import LoraConfig
+
+    config = LoraConfig(r=4, lora_alpha=4, target_modules=list(layers))
+    prior.unet.add_adapter(config, adapter_name=name)
+    generator = torch.Generator().manual_seed(seed)
+    for key, weight in prior.unet.named_parameters():
+        if f"lora_B.{name}" in key:
+            weight.data = gain * torch.randn(weight.shape, generator=generator)
+        weight.requires_grad_(False)
+    prior.adapters.add(name)
+
+
+def edit_json(path: Path, **values: object) -> None:
+    """Change values of a JSON object in a file."""
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
 def write_pipeline(folder: Path, parts: tuple[Any, Any, Any], **schedule: Any) -> None:

@@ -13,23 +13,32 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.builders.tiny_stable_diffusion import add_lora, make_tiny_stable_diffusion
 from tests.statistics import central_differences, compare_gradients
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.dataset_update import VALUES_PER_LATENT, DatasetUpdate
 from warpir.diffusion.draws import seed_of
 from warpir.diffusion.gradient_gate import NORM_COUNT_MIN, NORM_WINDOW, GradientGate
-from warpir.diffusion.guidance import Guidance, coefficients, kind_of
+from warpir.diffusion.guidance import Guidance, kind_of
 from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.prior import InChunks, at_once
 from warpir.diffusion.schedule import NoiseSchedule
 from warpir.diffusion.settings import GuidanceSettings, ModelSettings
 
-LOSSES = (
-    *("lds", "sds", "sds-base", "csd", "lds-lora-both", "lds-negative", "good-bad"),
-    "sds-good-bad",
-)
+PROMPTS = {"p": "a car in sks", "b": "a car", "null": "", "n": "a wrong shadow"}
+TERMS = {
+    "lds": ["p+", "null"],
+    "sds": ["p+", "null+"],
+    "sds-base": ["b", "null"],
+    "csd": ["b", "null"],
+    "lds-lora-both": ["p+", "null+"],
+    "lds-negative": ["p+", "n"],
+    "good-bad": ["b", "n"],
+    "sds-good-bad": ["p+", "n"],
+}
+"""Prompts of each loss, with the adapter after a +."""
+LOSSES = tuple(TERMS)
 FLOAT32 = 1e-5
 """About a hundred float32 operations; times, a and s are float32."""
 PROMPT = "a car in sks"
@@ -70,7 +79,6 @@ class GaussianPrior:
     """What the adapter adds to the means."""
     calls: list[Call] = field(default_factory=list)
     prompts: list[str] = field(default_factory=list)
-    embed_count: int = 0
     in_chunks: InChunks = at_once
 
     def upcast(self) -> bool:
@@ -90,7 +98,6 @@ class GaussianPrior:
         return mean + (self.adapter_shift if adapter else 0.0)
 
     def embed(self, prompts: Sequence[str]) -> Tensor:
-        self.embed_count += 1
         self.prompts += [p for p in prompts if p not in self.prompts]
         return torch.tensor([[[float(self.prompts.index(p))]] for p in prompts])
 
@@ -154,19 +161,6 @@ def literal_delta(loss: str, g: float, e: dict[str, Tensor], noise: Tensor) -> T
         "good-bad": lambda: e["b"] - e["n"],
         "sds-good-bad": lambda: (e["p+"] - noise) + 2.0 * (e["p+"] - e["n"]),
     }[loss]()
-
-
-PROMPTS = {"p": "a car in sks", "b": "a car", "null": "", "n": "a wrong shadow"}
-TERMS = {
-    "lds": ["p+", "null"],
-    "sds": ["p+", "null+"],
-    "sds-base": ["b", "null"],
-    "csd": ["b", "null"],
-    "lds-lora-both": ["p+", "null+"],
-    "lds-negative": ["p+", "n"],
-    "good-bad": ["b", "n"],
-    "sds-good-bad": ["p+", "n"],
-}
 
 
 @pytest.mark.parametrize("prediction_type", ["epsilon", "v_prediction", "sample"])
@@ -545,16 +539,6 @@ def test_restored_state_continues_identically(rng: np.random.Generator) -> None:
     assert ends[0] is not None and ends[1] is not None and torch.equal(*ends)
 
 
-def test_prompts_are_embedded_once(rng: np.random.Generator) -> None:
-    """Steps and scores use the embeddings of the start: the text encoder may be freed."""
-    prior = GaussianPrior()
-    made = guidance(prior, ASKED)
-    for step in range(3):
-        made.gradient(picture(rng), step)
-    made.score(picture(rng))
-    assert prior.embed_count == 1
-
-
 def test_gradient_has_the_pictures_shape_and_type(rng: np.random.Generator) -> None:
     """float32 in, float32 out, detached; the picture itself is left alone."""
     x = picture(rng, 20, 30).float()
@@ -675,27 +659,6 @@ def test_loss_without_its_adapter_is_refused() -> None:
                 kind_of(settings)(GaussianPrior(), PROMPT, settings, MASK, 10, 0, None)
 
 
-def test_loss_of_another_name_is_refused() -> None:
-    """The error lists all losses."""
-    with pytest.raises(ValueError, match=r"lds, sds, .*, dataset-update \(found 'vsd'\)"):
-        coefficients(replace(ASKED, loss="vsd"), has_adapter=True)
-
-
-@pytest.mark.parametrize(
-    ("settings", "adapter", "second"),
-    [
-        ({"loss": "lds-negative", "negative_prompt": "a wrong shadow"}, "scene", "a wrong shadow"),
-        ({"loss": "lds-negative", "negative_prompt": ""}, "scene", ""),
-        ({"loss": "csd"}, None, ""),
-    ],
-)
-def test_second_prompt_is_the_null_prompt_unless_named(
-    settings: dict[str, str], adapter: str | None, second: str
-) -> None:
-    made = Guidance(GaussianPrior(), "p", GuidanceSettings(**settings), MASK, 10, 0, adapter)
-    assert [term.prompt for term in made.terms] == ["p", second]
-
-
 @dataclass
 class EditingPrior(GaussianPrior):
     """Moves a picture towards grey, by the strength asked for."""
@@ -805,16 +768,8 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 def load_adapted(folder: Path, gain: float) -> StableDiffusion:
     """Return the tiny model with a LoRA ``scene``; gain 0 adapts nothing."""
-    from peft import LoraConfig
-
     prior = load_stable_diffusion(ModelSettings(model=str(folder)), "cpu")
-    layers = ["to_q", "to_k", "to_v", "to_out.0"]
-    prior.unet.add_adapter(LoraConfig(r=4, lora_alpha=4, target_modules=layers), "scene")
-    prior.adapters.add("scene")
-    g = torch.Generator().manual_seed(5)
-    for name, parameter in prior.unet.named_parameters():
-        if "lora_B" in name:
-            parameter.data = gain * torch.randn(parameter.shape, generator=g)
+    add_lora(prior, "scene", 5, gain)
     return prior
 
 
@@ -841,32 +796,6 @@ def test_zero_lora_makes_lds_equal_csd_exactly(rng: np.random.Generator, folder:
         first, second = lds.gradient(x, 4), csd.gradient(x, 4)
         assert first is not None and second is not None and second.norm() > 0
         assert torch.equal(first, second) is (gain == 0.0)
-
-
-def test_batch_of_terms_and_noises_equals_separate_calls(
-    rng: np.random.Generator, folder: Path
-) -> None:
-    """One sample at a time, the UNet predicts what it predicts in one batch."""
-    x, mask = photo(rng)
-    prior = load_adapted(folder, 0.5)
-    settings = replace(SD_SETTINGS, loss="sds", guidance_scale=7.5)
-    made = Guidance(prior, PROMPT, settings, mask, 10, 3, "scene")
-    together = made.gradient(x, 4)
-    predict = prior.predict
-    sizes = []
-
-    def one_by_one(
-        z: Tensor, t: Tensor, e: Tensor, adapters: Sequence[str | None], *_: None
-    ) -> Tensor:
-        sizes.append(len(z))
-        parts = [slice(i, i + 1) for i in range(len(z))]
-        return torch.cat([predict(z[p], t[p], e[p], adapters[p]) for p in parts])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prior, "predict", one_by_one)
-        separate = made.gradient(x, 4)
-    assert sizes == [4] and together is not None and separate is not None
-    assert compare_gradients(separate, together).relative_l2 < 2e-5  # float32, g = 7.5
 
 
 def test_gradient_passes_autoencoder_and_crop(rng: np.random.Generator, folder: Path) -> None:

@@ -3,6 +3,7 @@
 import copy
 import errno
 import json
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.builders.tiny_stable_diffusion import ATTENTION, make_tiny_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.personalization.lora_files import (
     Lora,
@@ -32,7 +33,6 @@ from warpir.diffusion.personalization.lora_files import (
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 MORE = (*ATTENTION, "proj_in", "ff.net.0.proj", "ff.net.2", "conv1", "time_emb_proj", "conv_in")
 TRIGGER = "a scene in the style of sks rendering"
 
@@ -259,48 +259,51 @@ def test_a_full_disk_leaves_the_old_files(tmp_path: Path, monkeypatch: pytest.Mo
 # Ways of naming
 
 
+def write_peft(lora: Lora, folder: Path, **config: Any) -> Path:
+    """Write a LoRA as peft does, its configuration beside it."""
+    whole = {"peft_type": "LORA", "r": 4, "target_modules": list(ATTENTION), **config}
+    (folder / "adapter_config.json").write_text(json.dumps(whole))
+    path = folder / "adapter_model.safetensors"
+    save_file({f"base_model.model.{k}": v for k, v in lora.weights.items()}, path)
+    return path
+
+
+def write_kohya(lora: Lora, path: Path, alpha: float | None) -> Path:
+    """Write a LoRA as kohya's scripts do, with or without its alphas."""
+    kohya = {}
+    for key, value in lora.weights.items():
+        layer, part = key.split(".lora_")
+        name = "lora_unet_" + layer.replace(".", "_")
+        way = "lora_down" if part.startswith("A") else "lora_up"
+        kohya[f"{name}.{way}.weight"] = value
+        if alpha is not None:
+            kohya[f"{name}.alpha"] = torch.tensor(alpha, dtype=torch.float16)
+    save_file(kohya, path)
+    return path
+
+
 def renamed(lora: Lora, style: str, folder: Path) -> Path:
     """Write a LoRA as other programs do, without our writer."""
-    alpha = next(iter(lora.alphas.values()))
-    config = {"peft_type": "LORA", "r": 4, "lora_alpha": alpha, "target_modules": list(ATTENTION)}
-    weights = dict(lora.weights)
-    path, header = folder / "lora.safetensors", {"format": "pt"}
-    own = json.dumps({f"unet.{key}": value for key, value in config.items()})
+    alpha, path = next(iter(lora.alphas.values())), folder / "lora.safetensors"
+    if style == "peft":
+        return write_peft(lora, folder, lora_alpha=alpha)
+    if style.startswith("kohya"):
+        return write_kohya(lora, path, alpha if style == "kohya" else None)
+    prefix = "" if style == "unet-alone" else "unet."
+    pairs = {}
     if style == "diffusers":
-        pair = {"lora_A": "lora.down", "lora_B": "lora.up"}
-        header["lora_adapter_metadata"] = own
-    elif style == "diffusers-peft":
-        pair = {}
-        header["lora_adapter_metadata"] = own
+        pairs = {"lora_A": "lora.down", "lora_B": "lora.up"}
     elif style == "diffusers-old":
-        pair = {".to_out.0.": ".to_out.", ".to_": ".processor.to_"}
-        pair |= {".lora_A": "_lora.down", ".lora_B": "_lora.up"}
-    elif style == "peft":
-        path = folder / "adapter_model.safetensors"
-        (folder / "adapter_config.json").write_text(json.dumps(config))
-        save_file({f"base_model.model.{k}": v for k, v in weights.items()}, path, header)
-        return path
-    elif style == "unet-alone":
-        header["lora_adapter_metadata"] = json.dumps(config)
-        save_file(weights, path, header)
-        return path
-    else:
-        kohya = {}
-        for key, value in weights.items():
-            layer, part = key.split(".lora_")
-            name = "lora_unet_" + layer.replace(".", "_")
-            way = "lora_down" if part.startswith("A") else "lora_up"
-            kohya[f"{name}.{way}.weight"] = value
-            if style == "kohya":
-                kohya[f"{name}.alpha"] = torch.tensor(alpha, dtype=torch.float16)
-        save_file(kohya, path)
-        return path
+        pairs = {".to_out.0.": ".to_out.", ".to_": ".processor.to_"}
+        pairs |= {".lora_A": "_lora.down", ".lora_B": "_lora.up"}
+    weights = {}
     for key, value in lora.weights.items():
-        new = key
-        for old, name in pair.items():
-            new = new.replace(old, name)
-        weights[f"unet.{new}"] = weights.pop(key) if value is not None else value
-    save_file(weights, path, header)
+        for ours, theirs in pairs.items():
+            key = key.replace(ours, theirs)
+        weights[prefix + key] = value
+    config = {"peft_type": "LORA", "r": 4, "lora_alpha": alpha, "target_modules": list(ATTENTION)}
+    header = {"lora_adapter_metadata": json.dumps({prefix + k: v for k, v in config.items()})}
+    save_file(weights, path, {} if style == "diffusers-old" else header)
     return path
 
 
@@ -332,30 +335,20 @@ def test_every_way_of_naming_is_read(tmp_path: Path, style: str, alpha: float) -
 def test_patterns_of_layers_are_names(tmp_path: Path) -> None:
     """An alpha for some layers is read; an expression that would never end is not run."""
     lora = random_lora(bare_prior())
-    weights = {f"base_model.model.{k}": v for k, v in lora.weights.items()}
-    save_file(weights, tmp_path / "adapter_model.safetensors")
     first = sorted(lora.alphas)[0]
-    config = {"r": 4, "lora_alpha": 4, "target_modules": list(ATTENTION)}
     for pattern in (first, f"^{first}$", first.replace(".", r"\.")):
-        text = json.dumps({**config, "alpha_pattern": {pattern: 2}})
-        (tmp_path / "adapter_config.json").write_text(text)
-        read = read_lora(tmp_path / "adapter_model.safetensors")
+        read = read_lora(write_peft(lora, tmp_path, lora_alpha=4, alpha_pattern={pattern: 2}))
         assert read.alphas[first] == 2.0 and set(read.alphas.values()) == {2.0, 4.0}
-    text = json.dumps({**config, "alpha_pattern": {"([a-z0-9_.]+)+X": 4}})
-    (tmp_path / "adapter_config.json").write_text(text)
+    path = write_peft(lora, tmp_path, lora_alpha=4, alpha_pattern={"([a-z0-9_.]+)+X": 4})
     with pytest.raises(ModelError, match="its configuration is damaged"):
-        read_lora(tmp_path / "adapter_model.safetensors")
+        read_lora(path)
 
 
 @pytest.mark.case("L8")
 def test_rank_stabilised_loras_keep_their_strength(tmp_path: Path) -> None:
     """The update is alpha / sqrt(rank) B A, as peft's configuration says."""
-    lora = random_lora(bare_prior())
-    config = {"r": 4, "lora_alpha": 3, "use_rslora": True, "target_modules": list(ATTENTION)}
-    weights = {f"base_model.model.{k}": v for k, v in lora.weights.items()}
-    save_file(weights, tmp_path / "adapter_model.safetensors")
-    (tmp_path / "adapter_config.json").write_text(json.dumps(config))
-    read = read_lora(tmp_path / "adapter_model.safetensors")
+    path = write_peft(random_lora(bare_prior()), tmp_path, lora_alpha=3, use_rslora=True)
+    read = read_lora(path)
     assert {alpha / 4 for alpha in read.alphas.values()} == {3 / 2}
 
 
@@ -403,77 +396,47 @@ def test_a_lora_for_another_base_is_refused_in_one_sentence(tmp_path: Path) -> N
 
 def broken(kind: str, folder: Path) -> Path:
     """Return a file with one fault."""
-    prior = bare_prior()
-    lora = random_lora(prior)
-    diffusers, kohya = save(lora, folder)
-    path = folder / "broken.safetensors"
-    named = load_file(diffusers)
-    with_header = {"format": "pt", "lora_adapter_metadata": json.dumps({"unet.r": 4})}
-    first = next(iter(named))
-    if kind == "pickle":
-        path = folder / "broken.bin"
-        torch.save(named, path)
-    elif kind == "old pickle":
-        torch.save(named, path, _use_new_zipfile_serialization=False)
-    elif kind == "truncated":
-        path.write_bytes(diffusers.read_bytes()[:-100])
-    elif kind == "huge header":
-        path.write_bytes((1 << 62).to_bytes(8, "little") + diffusers.read_bytes()[8:])
-    elif kind == "pointer":
-        path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
-    elif kind == "absent":
-        pass
+    diffusers, kohya = save(random_lora(bare_prior()), folder)
+    whole, named, of_kohya = diffusers.read_bytes(), load_file(diffusers), load_file(kohya)
+    path = folder / ("broken.bin" if kind == "pickle" else "broken.safetensors")
+    first, first_up = next(iter(named)), next(key for key in of_kohya if "lora_up" in key)
+    contents = {
+        "truncated": whole[:-100],
+        "huge header": (1 << 62).to_bytes(8, "little") + whole[8:],
+        "pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n",
+    }
+    tensors = {
+        "empty": {},
+        "foreign": {"model.layers.0.weight": torch.ones(2)},
+        "some foreign": {**named, "unet.conv_in.weight": torch.ones(2)},
+        "one part": {k: v for k, v in named.items() if k != first},
+        "not whole": {k: v for k, v in named.items() if "mid_block" not in k},
+        "unknown layers": {k.replace("mid_block", "mid_blocks"): v for k, v in named.items()},
+        "nan": {**named, first: torch.full_like(named[first], math.nan)},
+        "rank 0": {k: v[:0] if ".down." in k else v[:, :0] for k, v in named.items()},
+        "other shape": {**named, first: torch.ones(4, 5)},
+        "parts that do not fit": {**named, first: torch.ones(3, named[first].shape[1])},
+        "text encoder": {**of_kohya, "lora_te_text_model_x.lora_down.weight": torch.ones(2)},
+        "weight decomposed": {**of_kohya, "lora_unet_mid_block_x.dora_scale": torch.ones(2)},
+        "kohya without up": {k: v for k, v in of_kohya.items() if k != first_up},
+        "alpha nan": {k: v * math.nan if "alpha" in k else v for k, v in of_kohya.items()},
+    }
+    configs = {
+        "not whole": json.dumps({"unet.target_modules": list(ATTENTION), "unet.lora_alpha": 4}),
+        "header not JSON": "{",
+        "header a list": "[]",
+        "header alpha text": json.dumps({"unet.lora_alpha": "much"}),
+        "dora in the header": json.dumps({"unet.lora_alpha": 4, "unet.use_dora": True}),
+    }
+    if kind in ("pickle", "old pickle"):
+        torch.save(named, path, _use_new_zipfile_serialization=kind == "pickle")
+    elif kind in contents:
+        path.write_bytes(contents[kind])
     elif kind == "folder":
         path.mkdir()
-    elif kind == "empty":
-        save_file({}, path)
-    elif kind == "foreign":
-        save_file({"model.layers.0.weight": torch.ones(2)}, path)
-    elif kind == "some foreign":
-        save_file({**named, "unet.conv_in.weight": torch.ones(2)}, path)
-    elif kind == "one part":
-        save_file({k: v for k, v in named.items() if k != first}, path)
-    elif kind == "not whole":
-        cut = [k for k in named if "mid_block" not in k]
-        config = json.dumps({"unet.target_modules": list(ATTENTION), "unet.lora_alpha": 4})
-        save_file({k: named[k] for k in cut}, path, {"lora_adapter_metadata": config})
-    elif kind == "unknown layers":
-        save_file({k.replace("mid_block", "mid_blocks"): v for k, v in named.items()}, path)
-    elif kind == "nan":
-        save_file({**named, first: torch.full_like(named[first], float("nan"))}, path)
-    elif kind == "rank 0":
-        save_file(
-            {k: v[:0] if "down" in k.split(".")[-2] else v[:, :0] for k, v in named.items()}, path
-        )
-    elif kind == "other shape":
-        save_file({k: torch.ones(4, 5) if k == first else v for k, v in named.items()}, path)
-    elif kind == "parts that do not fit":
-        save_file({**named, first: torch.ones(3, named[first].shape[1])}, path)
-    elif kind == "text encoder":
-        save_file(
-            {**load_file(kohya), "lora_te_text_model_x.lora_down.weight": torch.ones(2)}, path
-        )
-    elif kind == "weight decomposed":
-        save_file({**load_file(kohya), "lora_unet_mid_block_x.dora_scale": torch.ones(2)}, path)
-    elif kind == "kohya without up":
-        whole = load_file(kohya)
-        gone = next(k for k in whole if "lora_up" in k)
-        save_file({k: v for k, v in whole.items() if k != gone}, path)
-    elif kind == "alpha nan":
-        whole = load_file(kohya)
-        save_file(
-            {k: v * float("nan") if k.endswith("alpha") else v for k, v in whole.items()}, path
-        )
-    elif kind == "header not JSON":
-        save_file(named, path, {**with_header, "lora_adapter_metadata": "{"})
-    elif kind == "header a list":
-        save_file(named, path, {**with_header, "lora_adapter_metadata": "[]"})
-    elif kind == "header alpha text":
-        config = json.dumps({"unet.lora_alpha": "much"})
-        save_file(named, path, {**with_header, "lora_adapter_metadata": config})
-    elif kind == "dora in the header":
-        config = json.dumps({"unet.lora_alpha": 4, "unet.use_dora": True})
-        save_file(named, path, {**with_header, "lora_adapter_metadata": config})
+    elif kind != "absent":
+        header = {"lora_adapter_metadata": configs[kind]} if kind in configs else None
+        save_file(tensors.get(kind, named), path, header)
     return path
 
 

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 
 from tests.builders.faults import NO_TORCH, assert_fails
 from tests.builders.insertions import arguments
-from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.builders.tiny_stable_diffusion import edit_json, make_tiny_stable_diffusion
 from warpir.diffusion.models.hub import find_model, hub_offline, needed_files
 from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
@@ -37,6 +37,11 @@ UNET = "unet/diffusion_pytorch_model.safetensors"
 VAE = "vae/diffusion_pytorch_model.safetensors"
 TEXT = "text_encoder/model.safetensors"
 INDEX = "unet/diffusion_pytorch_model.safetensors.index.json"
+PICKLES = {
+    UNET: "unet/diffusion_pytorch_model.bin",
+    VAE: "vae/diffusion_pytorch_model.bin",
+    TEXT: "text_encoder/pytorch_model.bin",
+}
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3463726498\n"
 
 
@@ -71,10 +76,6 @@ def refuse(model: Path | str, *words: str) -> ModelError:
     for word in words:
         assert word in sentence
     return caught.value
-
-
-def edit_json(path: Path, **values: object) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
 
 
 def edit_weights(path: Path, change: Callable[[dict[str, torch.Tensor]], object]) -> None:
@@ -161,14 +162,13 @@ def huge(name: str) -> Plant:
     return plant
 
 
-def only_pickles(*names: str, payload: object = b"") -> Plant:
+def only_pickles(*names: str) -> Plant:
     """Replace weights by pickles under the names that diffusers gives them."""
 
     def plant(folder: Path) -> None:
         for name in names:
             (folder / name).unlink()
-            stem = "pytorch_model" if name == TEXT else "diffusion_pytorch_model"
-            (folder / name).with_name(f"{stem}.bin").write_bytes(pickle.dumps(payload))
+            (folder / PICKLES[name]).write_bytes(pickle.dumps(b""))
 
     return plant
 
@@ -608,9 +608,8 @@ def test_schedules_that_are_none_are_refused(
 
 def pickled(folder: Path) -> None:
     """Turn all weights into pickles of plain tensors."""
-    for name in (UNET, VAE, TEXT):
-        stem = "pytorch_model" if name == TEXT else "diffusion_pytorch_model"
-        torch.save(load_file(folder / name), (folder / name).with_name(f"{stem}.bin"))
+    for name, pickled_name in PICKLES.items():
+        torch.save(load_file(folder / name), folder / pickled_name)
         (folder / name).unlink()
 
 
@@ -652,8 +651,7 @@ def test_malicious_pickles_run_nothing(
             return (Path.touch, (tmp_path / "it ran",))
 
     pickled(folder)
-    stem = "pytorch_model" if part == TEXT else "diffusion_pytorch_model"
-    path = (folder / part).with_name(f"{stem}.bin")
+    path = folder / PICKLES[part]
     if form == "plain":
         path.write_bytes(pickle.dumps(Malicious()))
     else:

@@ -13,7 +13,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.builders.tiny_stable_diffusion import RESOLUTION, make_tiny_stable_diffusion
+from tests.builders.tiny_stable_diffusion import (
+    ATTENTION,
+    RESOLUTION,
+    add_lora,
+    edit_json,
+    make_tiny_stable_diffusion,
+)
 from warpir.diffusion.cache import model_key
 from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
@@ -23,6 +29,7 @@ from warpir.diffusion.settings import PREDICTION_TYPES, ModelSettings
 ROUNDING = 1e-5
 """Between two orders of the same float32 sums, on values of about 1."""
 LATENT = RESOLUTION // 8
+LAYERS = (*ATTENTION, "conv1")
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -58,26 +65,12 @@ def fresh(folders: Callable[[str], Path]) -> StableDiffusion:
     return load(folders("epsilon"))
 
 
-def add_lora(prior: StableDiffusion, name: str, seed: int) -> None:
-    """Add a LoRA that does something: peft starts B at zero."""
-    from peft import LoraConfig
-
-    layers = ["to_q", "to_k", "to_v", "to_out.0", "conv1"]
-    prior.unet.add_adapter(LoraConfig(r=4, lora_alpha=4, target_modules=layers), adapter_name=name)
-    generator = torch.Generator().manual_seed(seed)
-    for key, weight in prior.unet.named_parameters():
-        if f"lora_B.{name}" in key:
-            weight.data = 0.2 * torch.randn(weight.shape, generator=generator)
-        weight.requires_grad_(False)
-    prior.adapters.add(name)
-
-
 @pytest.fixture(scope="module")
 def adapted(folders: Callable[[str], Path]) -> StableDiffusion:
     """Model with two LoRAs, first and second."""
     prior = load(folders("epsilon"))
-    add_lora(prior, "first", 1)
-    add_lora(prior, "second", 2)
+    add_lora(prior, "first", 1, layers=LAYERS)
+    add_lora(prior, "second", 2, layers=LAYERS)
     return prior
 
 
@@ -115,25 +108,13 @@ def test_attention_processors_are_left_alone(prior: StableDiffusion) -> None:
 def test_other_shapes_work_alike(tmp_path: Path) -> None:
     """As Stable Diffusion 1.5: another width, a tokenizer that pads with its end, no v."""
     folder = make_tiny_stable_diffusion(tmp_path, cross_attention_dim=48)
-    config = folder / "unet/config.json"
-    config.write_text(json.dumps({**json.loads(config.read_text()), "sample_size": 16}))
-    special = folder / "tokenizer/special_tokens_map.json"
-    special.write_text(
-        json.dumps({**json.loads(special.read_text()), "pad_token": "<|endoftext|>"})
-    )
-    scheduler = folder / "scheduler/scheduler_config.json"
-    scheduler.write_text(
-        json.dumps(
-            {
-                "_class_name": "PNDMScheduler",
-                "beta_start": 0.00085,
-                "beta_end": 0.012,
-                "beta_schedule": "scaled_linear",
-                "skip_prk_steps": True,
-                "steps_offset": 1,
-            }
-        )
-    )
+    edit_json(folder / "unet/config.json", sample_size=16)
+    edit_json(folder / "tokenizer/special_tokens_map.json", pad_token="<|endoftext|>")
+    scheduler = {
+        "_class_name": "PNDMScheduler", "beta_start": 0.00085, "beta_end": 0.012,
+        "beta_schedule": "scaled_linear", "skip_prk_steps": True, "steps_offset": 1,
+    }  # fmt: skip
+    (folder / "scheduler/scheduler_config.json").write_text(json.dumps(scheduler))
     prior = load(folder)
     assert prior.resolution == 128 and prior.schedule.prediction_type == "epsilon"
     images = prior.sample(["a scene"], [1], steps=2, scale=7.5)
@@ -157,10 +138,9 @@ def test_schedule_is_the_configuration_s(
 
 def test_trained_betas_are_used(folders: Callable[[str], Path], tmp_path: Path) -> None:
     folder = Path(shutil.copytree(folders("epsilon"), tmp_path / "model"))
-    config = folder / "scheduler/scheduler_config.json"
     betas = torch.linspace(0.01, 0.3, 50).tolist()
-    values = {"trained_betas": betas, "num_train_timesteps": 50}
-    config.write_text(json.dumps({**json.loads(config.read_text()), **values}))
+    config = folder / "scheduler/scheduler_config.json"
+    edit_json(config, trained_betas=betas, num_train_timesteps=50)
     prior = load(folder)
     expected = torch.tensor([math.prod(1.0 - b for b in betas[: i + 1]) for i in range(50)])
     torch.testing.assert_close(prior.schedule.alphas_cumprod.float(), expected)
@@ -609,7 +589,7 @@ def test_cpu_computes_in_fp32_and_says_so(folders: Callable[[str], Path]) -> Non
 @pytest.fixture
 def low(fresh: StableDiffusion) -> Iterator[StableDiffusion]:
     """UNet in bf16, as on a GPU; the CPU can do it too."""
-    add_lora(fresh, "scene", 1)
+    add_lora(fresh, "scene", 1, layers=LAYERS)
     fresh.unet.to(torch.bfloat16)
     fresh.unet_dtype = torch.bfloat16
     yield fresh
