@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -98,7 +99,7 @@ def _load(
 ) -> Any:
     """Load one part's network, with exactly the weights it needs, all finite in its precision."""
     path, weights = folder.path / part, folder.weights[part]
-    with _one_sentence(str(path)):
+    with _one_sentence(path):
         network, loaded = kind.from_pretrained(
             path,
             dtype=DTYPES[precision],
@@ -111,24 +112,24 @@ def _load(
     for word, what in (("missing_keys", "lacks"), ("unexpected_keys", "has foreign")):
         if loaded[word]:
             names = sorted(loaded[word])
-            raise ModelError(str(path), f"{what} weights ({len(names)}, such as {names[0]})")
+            raise ModelError(path, f"{what} weights ({len(names)}, such as {names[0]})")
     network = network.to(device)
     for name, weight in network.named_parameters():
         if not bool(torch.isfinite(weight).all()):
-            raise ModelError(str(path), f"{name} is not finite in {precision}")
+            raise ModelError(path, f"{name} is not finite in {precision}")
     return network
 
 
 def _load_tokenizer(folder: ModelFolder, vocabulary: int) -> CLIPTokenizer:
     """Load the tokenizer, whose ids the text encoder must have."""
     path = folder.path / "tokenizer"
-    with _one_sentence(str(path)):
+    with _one_sentence(path):
         tokenizer = CLIPTokenizer.from_pretrained(
             path, local_files_only=True, trust_remote_code=False
         )
         count = len(tokenizer)
     if count > vocabulary:
-        raise ModelError(str(path), f"{count} tokens (expected {vocabulary}, the text encoder's)")
+        raise ModelError(path, f"{count} tokens (expected {vocabulary}, the text encoder's)")
     return tokenizer
 
 
@@ -146,7 +147,7 @@ def _noise_schedule(config: dict[str, Any]) -> NoiseSchedule:
 
 
 @contextmanager
-def _one_sentence(where: str) -> Iterator[None]:
+def _one_sentence(where: str | Path) -> Iterator[None]:
     """Turn what a library raises, but a lack of memory, into one `ModelError`; hush its log."""
     logs = [logging.getLogger(name) for name in ("diffusers", "transformers")]
     levels = [log.level for log in logs]

@@ -1,5 +1,7 @@
 """The one error of models, apart from torch: folders and files are checked before it is loaded."""
 
+from pathlib import Path
+
 
 class ModelError(Exception):
     """A model folder or LoRA file cannot be used; the program prints one line and exits with 4.
@@ -10,6 +12,6 @@ class ModelError(Exception):
         advice: What to do about it, or an empty string.
     """
 
-    def __init__(self, where: str, what: str, advice: str = "") -> None:
+    def __init__(self, where: str | Path, what: str, advice: str = "") -> None:
         super().__init__(f"{where}: {what}")
         self.where, self.what, self.advice = str(where), what, advice

@@ -162,9 +162,7 @@ def check_model_folder(folder: Path, allow_pickle: bool = False) -> ModelFolder:
     configs = {part: read_json(folder / part / name) for part, name in CONFIGS.items()}
     for part in WEIGHTS:
         if "quantization_config" in configs[part]:
-            raise ModelError(
-                str(folder / part), "quantised weights (expected fp16 or fp32)", ADVICE
-            )
+            raise ModelError(folder / part, "quantised weights (expected fp16 or fp32)", ADVICE)
     _check_unet(folder / "unet/config.json", configs["unet"])
     _check_vae(folder / "vae/config.json", configs["vae"])
     _check_text_encoder(folder / "text_encoder/config.json", configs)
@@ -193,7 +191,7 @@ def read_json(path: Path) -> dict[str, Any]:
         return read_json_object(path)
     except (InputError, OSError) as error:
         reason = error.what if isinstance(error, InputError) else error.strerror
-        raise ModelError(str(path), f"not JSON ({reason})", "fetch the model again") from error
+        raise ModelError(path, f"not JSON ({reason})", "fetch the model again") from error
 
 
 def _check_files(folder: Path) -> None:
@@ -208,20 +206,19 @@ def _check_files(folder: Path) -> None:
     for place in (folder, *(folder / part for part in PARTS)):
         for file in sorted(place.iterdir()) if place.is_dir() else ():
             if file.suffix == ".py":
-                raise ModelError(
-                    str(file), "a model folder holds no code", "it is never run: delete it"
-                )
+                what = "a model folder holds no code"
+                raise ModelError(file, what, "it is never run: delete it")
             if file.is_dir() or (place == folder and file.name != "model_index.json"):
                 continue
             real = os.path.realpath(file)
             if not any(os.path.commonpath([real, root]) == root for root in inside):
                 what = "a link that leads out of the model folder"
-                raise ModelError(str(file), what, "put a copy of the file in its place")
+                raise ModelError(file, what, "put a copy of the file in its place")
             if not file.is_file():
-                raise ModelError(str(file), "not a regular file")
+                raise ModelError(file, "not a regular file")
             if file.suffix in TEXTS and file.stat().st_size > JSON_LIMIT:
                 what = f"too large (found {file.stat().st_size} bytes; expected at most "
-                raise ModelError(str(file), f"{what}{JSON_LIMIT})")
+                raise ModelError(file, f"{what}{JSON_LIMIT})")
 
 
 def _check_classes(folder: Path) -> None:
@@ -230,14 +227,13 @@ def _check_classes(folder: Path) -> None:
     if not path.is_file():
         names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
         found = ", ".join(names[:5]) or "nothing"
-        raise ModelError(
-            str(folder), f"no model_index.json (found {found}; expected diffusers' layout)", ADVICE
-        )
+        what = f"no model_index.json (found {found}; expected diffusers' layout)"
+        raise ModelError(folder, what, ADVICE)
     index = read_json(path)
     kind = index.get("_class_name")
     if kind != PIPELINE:
         what = f"_class_name {kind!r} (expected {PIPELINE}, as in Stable Diffusion 1.5 and 2.x)"
-        raise ModelError(str(path), what, ADVICE)
+        raise ModelError(path, what, ADVICE)
     for part, entry in index.items():
         if not isinstance(entry, list) or entry == [None, None]:
             continue
@@ -245,7 +241,7 @@ def _check_classes(folder: Path) -> None:
         if len(entry) != 2 or entry[0] != library or entry[1] not in classes:
             expected = f"{library} {' or '.join(classes)}" if classes else "no such part"
             what = f"{part}: unknown class {'.'.join(map(str, entry))!r} (expected {expected})"
-            raise ModelError(str(path), what, "a model's own code is never run")
+            raise ModelError(path, what, "a model's own code is never run")
 
 
 def missing_files(folder: Path, allow_pickle: bool = False) -> list[str]:
@@ -278,7 +274,7 @@ def _check_complete(folder: Path, allow_pickle: bool) -> None:
         advice = "save the model as safetensors (diffusers: save_pretrained)"
         if not missing_files(folder, allow_pickle=True):
             advice += ", or allow torch's reader of plain tensors to read them by --allow-pickle"
-    raise ModelError(str(folder), what, advice)
+    raise ModelError(folder, what, advice)
 
 
 def _check_unet(path: Path, config: dict[str, Any]) -> None:
@@ -288,11 +284,11 @@ def _check_unet(path: Path, config: dict[str, Any]) -> None:
         if found != LATENT_CHANNELS:
             kind = "; 9 are those of an inpainting model" if found == 9 else ""
             what = f"{name} {found!r} (expected {LATENT_CHANNELS}{kind})"
-            raise ModelError(str(path), what, ADVICE)
+            raise ModelError(path, what, ADVICE)
     for name in ("addition_embed_type", "class_embed_type", "encoder_hid_dim"):
         if config.get(name) is not None:
             what = f"{name} {config[name]!r} (expected none): Stable Diffusion XL or another model"
-            raise ModelError(str(path), what, ADVICE)
+            raise ModelError(path, what, ADVICE)
     for name in ("sample_size", "cross_attention_dim"):
         _check_whole(path, name, config.get(name), 8192)
     _check_blocks(path, config)
@@ -301,13 +297,13 @@ def _check_unet(path: Path, config: dict[str, Any]) -> None:
 def _check_whole(path: Path, name: str, value: object, limit: int) -> None:
     """Check that a value is a whole number of a network that can be."""
     if type(value) is not int or not 1 <= value <= limit:
-        raise ModelError(str(path), f"{name} {value!r:.60} (expected a whole number to {limit})")
+        raise ModelError(path, f"{name} {value!r:.60} (expected a whole number to {limit})")
 
 
 def _check_activation(path: Path, name: str, value: object, known: tuple[str, ...]) -> None:
     """Check that an activation is one that its library has."""
     if value not in known:
-        raise ModelError(str(path), f"{name} {value!r:.60} (expected {', '.join(known)})", ADVICE)
+        raise ModelError(path, f"{name} {value!r:.60} (expected {', '.join(known)})", ADVICE)
 
 
 def _check_blocks(path: Path, config: dict[str, Any]) -> None:
@@ -315,7 +311,7 @@ def _check_blocks(path: Path, config: dict[str, Any]) -> None:
     channels = config.get("block_out_channels")
     if not isinstance(channels, list) or not 1 <= len(channels) <= 8:
         what = f"block_out_channels {channels!r:.60} (expected a list of 1 to 8 whole numbers)"
-        raise ModelError(str(path), what, ADVICE)
+        raise ModelError(path, what, ADVICE)
     for value in channels:
         _check_whole(path, "block_out_channels", value, 8192)
     _check_activation(path, "act_fn", config.get("act_fn", "silu"), ACTIVATIONS)
@@ -333,13 +329,13 @@ def _check_vae(path: Path, config: dict[str, Any]) -> None:
         ("latent_channels", LATENT_CHANNELS),
     ):
         if config.get(name, expected) != expected:
-            raise ModelError(str(path), f"{name} {config[name]!r} (expected {expected})", ADVICE)
+            raise ModelError(path, f"{name} {config[name]!r} (expected {expected})", ADVICE)
     factor = config.get("scaling_factor", 1.0)
     if not isinstance(factor, int | float) or not 0.0 < factor < 1e3:
-        raise ModelError(str(path), f"scaling_factor {factor!r} (expected a positive number)")
+        raise ModelError(path, f"scaling_factor {factor!r} (expected a positive number)")
     for name in ("shift_factor", "latents_mean"):
         if config.get(name) is not None:
-            raise ModelError(str(path), f"{name} (expected none, as in Stable Diffusion 2)", ADVICE)
+            raise ModelError(path, f"{name} (expected none, as in Stable Diffusion 2)", ADVICE)
     _check_blocks(path, config)
 
 
@@ -347,11 +343,11 @@ def _check_text_encoder(path: Path, configs: dict[str, dict[str, Any]]) -> None:
     """Check that the text encoder can be one, and that its embeddings fit the UNet."""
     if (path.parent / "adapter_config.json").exists():
         # transformers would follow it to another model, which it names.
-        raise ModelError(str(path.parent), "holds an adapter (expected the text encoder alone)")
+        raise ModelError(path.parent, "holds an adapter (expected the text encoder alone)")
     found, expected = configs["text_encoder"].get("hidden_size"), configs["unet"]
     if found != expected["cross_attention_dim"]:
         what = f"hidden_size {found!r} (expected {expected['cross_attention_dim']}, the UNet's)"
-        raise ModelError(str(path), what, "the parts are of different models")
+        raise ModelError(path, what, "the parts are of different models")
     for name, (default, limit) in TEXT_SIZES.items():
         _check_whole(path, name, configs["text_encoder"].get(name, default), limit)
     activation = configs["text_encoder"].get("hidden_act", "quick_gelu")
@@ -363,10 +359,10 @@ def _check_scheduler(path: Path, config: dict[str, Any]) -> None:
     kind = config.get("prediction_type", "epsilon")
     if kind not in PREDICTION_TYPES:
         what = f"prediction_type {kind!r:.60} (expected {', '.join(PREDICTION_TYPES)})"
-        raise ModelError(str(path), what, ADVICE)
+        raise ModelError(path, what, ADVICE)
     count = config.get("num_train_timesteps", 1000)
     if type(count) is not int or not 2 <= count <= 100_000:
-        raise ModelError(str(path), f"num_train_timesteps {count!r:.60} (expected 2 to 100000)")
+        raise ModelError(path, f"num_train_timesteps {count!r:.60} (expected 2 to 100000)")
 
 
 def _check_tokenizer(folder: Path, vocabulary: int) -> None:
@@ -383,15 +379,15 @@ def _check_tokenizer(folder: Path, vocabulary: int) -> None:
             odd = [word for word, place in content.items() if type(place) is not int or place < 0]
             if odd:
                 what = f"the id of {odd[0]!r:.40} is {content[odd[0]]!r:.40} (expected 0, 1, ...)"
-                raise ModelError(str(path), what, "fetch the model again")
+                raise ModelError(path, what, "fetch the model again")
     if len(words) > vocabulary:
         what = f"{len(words)} tokens (expected {vocabulary}, the text encoder's)"
-        raise ModelError(str(folder), what, "the parts are of different models")
+        raise ModelError(folder, what, "the parts are of different models")
     for path in sorted(folder.glob("*.txt")):
         try:
             path.read_text(encoding="utf-8")
         except (OSError, ValueError) as error:
-            raise ModelError(str(path), "not UTF-8 text", "fetch the model again") from error
+            raise ModelError(path, "not UTF-8 text", "fetch the model again") from error
 
 
 def expected_shapes(part: str, config: dict[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -441,10 +437,10 @@ def _check_shapes(
         # Text encoders come with and without the name of the model around them.
         names = [name for name in found if name == end or name == f"text_model.{end}"]
         if not names:
-            raise ModelError(str(folder), f"lacks weights ({end}, by its config.json)", ADVICE)
+            raise ModelError(folder, f"lacks weights ({end}, by its config.json)", ADVICE)
         if found[names[0]] != shape:
             what = f"{names[0]}: shape {list(found[names[0]])} (expected {list(shape)}, by its "
-            raise ModelError(str(folder), f"{what}config.json)", "fetch the model again")
+            raise ModelError(folder, f"{what}config.json)", "fetch the model again")
 
 
 def _find_weights(folder: Path, part: str, allow_pickle: bool) -> Weights:
@@ -455,15 +451,15 @@ def _find_weights(folder: Path, part: str, allow_pickle: bool) -> Weights:
         return Weights((path,), variant)
     shards = read_json(path).get("weight_map")
     if not isinstance(shards, dict) or not shards:
-        raise ModelError(str(path), "no weight_map (expected weights and their files)")
+        raise ModelError(path, "no weight_map (expected weights and their files)")
     names = sorted({str(shard) for shard in shards.values()})
     for shard in names:
         # The name comes from the file: it must not lead out of the folder.
         if Path(shard).name != shard or not shard.endswith(".safetensors"):
-            raise ModelError(str(path), f"a shard called {shard!r} (expected *.safetensors)")
+            raise ModelError(path, f"a shard called {shard!r} (expected *.safetensors)")
     missing = [shard for shard in names if not (folder / shard).is_file()]
     if missing:
-        raise ModelError(str(folder), f"missing {', '.join(missing)}", ADVICE)
+        raise ModelError(folder, f"missing {', '.join(missing)}", ADVICE)
     return Weights(tuple(folder / shard for shard in names), variant)
 
 
@@ -473,7 +469,7 @@ def _check_header(file: Path) -> dict[str, tuple[int, ...]]:
     for name, kind in header.kinds.items():
         # Old text encoders carry the numbers of their positions along.
         if kind not in DTYPES and not name.endswith("position_ids"):
-            raise ModelError(str(file), f"{name}: {kind} (expected {', '.join(DTYPES)})")
+            raise ModelError(file, f"{name}: {kind} (expected {', '.join(DTYPES)})")
     return header.shapes
 
 
@@ -481,4 +477,4 @@ def _check_pointer(path: Path) -> None:
     """Recognise what git leaves in place of a large file."""
     with path.open("rb") as stream:
         if is_pointer(stream.read(64)):
-            raise ModelError(str(path), *POINTER)
+            raise ModelError(path, *POINTER)

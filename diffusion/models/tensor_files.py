@@ -25,7 +25,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         with safe_open(path, framework="pt", device="cpu") as file:
             return {key: file.get_tensor(key) for key in file.keys()}, header.about
     except (SafetensorError, OSError, RuntimeError) as error:
-        raise ModelError(str(path), *fault_of(path)) from error
+        raise ModelError(path, *fault_of(path)) from error
 
 
 def serialize(tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> bytes:

@@ -84,10 +84,10 @@ def read_header(path: Path) -> WeightFile:
         ModelError: It is not there, or not a whole safetensors file.
     """
     if path.is_dir():
-        raise ModelError(str(path), "is a folder (expected a safetensors file)")
+        raise ModelError(path, "is a folder (expected a safetensors file)")
     if not path.is_file():
         what = "not a regular file" if path.exists() else "no such file"
-        raise ModelError(str(path), f"{what} (expected a safetensors file)")
+        raise ModelError(path, f"{what} (expected a safetensors file)")
     try:
         with safe_open(path, framework="np") as content:
             slices = {name: content.get_slice(name) for name in content.keys()}
@@ -98,7 +98,7 @@ def read_header(path: Path) -> WeightFile:
                 {name: part.get_dtype() for name, part in slices.items()},
             )
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
-        raise ModelError(str(path), *fault_of(path)) from error
+        raise ModelError(path, *fault_of(path)) from error
 
 
 POINTER = ("a Git LFS pointer, not the file itself", "run `git lfs pull` in its folder")
@@ -139,16 +139,15 @@ def check_regressor(path: Path | None) -> WeightFile:
         ModelError: Not there, damaged, or something else.
     """
     file = _check_photo_network(path, "regressor", REGRESSOR_FORMAT, REGRESSOR_SIZES)
-    where = str(file.path)
     temperature, directions = (_value(file, name) for name in ("temperature", "directions"))
     if temperature is None or temperature.shape != () or not temperature > 0.0:
-        raise ModelError(where, "temperature: not a number above 0")
+        raise ModelError(file.path, "temperature: not a number above 0")
     if (
         directions is None
         or directions.ndim != 2
         or not np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-3)
     ):
-        raise ModelError(where, "directions: not of length 1")
+        raise ModelError(file.path, "directions: not of length 1")
     return file
 
 
@@ -157,7 +156,7 @@ def check_calibrator(path: Path | None) -> WeightFile:
     file = _check_photo_network(path, "calibrator", CALIBRATOR_FORMAT, CALIBRATOR_SIZES)
     spread = _value(file, "spread")
     if spread is None or spread.ndim != 1 or not (spread > 0.0).all():
-        raise ModelError(str(file.path), "spread: not numbers above 0")
+        raise ModelError(file.path, "spread: not numbers above 0")
     return file
 
 
@@ -168,7 +167,7 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
     """
     shipped = SHIPPED / f"{name}.safetensors"
     file = read_header(path or shipped)
-    where = str(file.path)
+    where = file.path
     if file.about.get("format") != format_:
         found = str(file.about.get("format"))[:40]
         label = {"regressor": "light regressor", "calibrator": "camera network"}[name]
@@ -182,7 +181,7 @@ def _check_photo_network(path: Path | None, name: str, format_: str, sizes: Size
         raise ModelError(where, f"{what} (expected multiples of 8, the last of the heads too)")
     if path is not None and shipped.is_file():
         ours = read_header(shipped)
-        if _object(str(shipped), ours.about["config"]) == config:
+        if _object(shipped, ours.about["config"]) == config:
             _check_shapes(file, ours)
     _check_written(file, file.about.get("weights"), file.about["config"])
     _check_built(file, config)
@@ -207,10 +206,10 @@ def _check_built(file: WeightFile, config: Mapping[str, Any]) -> None:
         fits = fits and found == expected and widths == [(w,) for w in config["channels"]]
     if not fits:
         what = "damaged (the weights are not those of its network)"
-        raise ModelError(str(file.path), what)
+        raise ModelError(file.path, what)
 
 
-def _check_sizes(where: str, config: Mapping[str, Any], sizes: Sizes) -> None:
+def _check_sizes(where: Path, config: Mapping[str, Any], sizes: Sizes) -> None:
     """Check what a header says of its network, before one is built."""
     if set(config) != set(sizes):
         raise ModelError(where, "its header is damaged (other sizes of a network than expected)")
@@ -238,11 +237,10 @@ def check_lora(path: Path, embedding_width: int | None) -> None:
         ModelError: Damaged, something else, of rank 0, or made for another base.
     """
     file = read_header(path)
-    where = str(path)
     named = {key.removeprefix("base_model.model."): s for key, s in file.shapes.items()}
     if any(key.startswith(_FOR_TEXT) for key in named):
         what = "adapts the text encoder too, which stays as it is here"
-        raise ModelError(where, what, "give a LoRA of the UNet alone")
+        raise ModelError(path, what, "give a LoRA of the UNet alone")
     layers: dict[str, dict[str, tuple[int, ...]]] = {}
     odd = []
     for key, shape in named.items():
@@ -252,24 +250,24 @@ def check_lora(path: Path, embedding_width: int | None) -> None:
         elif not key.endswith(".alpha"):
             odd.append(key)
         elif math.prod(shape) != 1:
-            raise ModelError(where, f"{key}: shape {list(shape)} (expected one number)")
+            raise ModelError(path, f"{key}: shape {list(shape)} (expected one number)")
     if odd or not layers:
         raise not_a_lora(path, odd, len(named))
     for layer, parts in layers.items():
         if set(parts) != {"A", "B"}:
             what = f"{layer}: only one of its two parts is there; the file is not whole"
-            raise ModelError(where, what)
+            raise ModelError(path, what)
         a, b = parts["A"], parts["B"]
         if len(a) not in (2, 4) or len(a) != len(b) or a[0] != b[1]:
             what = f"{layer}: its parts do not fit (found {list(a)}, {list(b)}; expected [r, i], "
-            raise ModelError(where, f"{what}[o, r])")
+            raise ModelError(path, f"{what}[o, r])")
         if a[0] == 0:
-            raise ModelError(where, f"{layer}: rank 0 (expected at least 1)")
+            raise ModelError(path, f"{layer}: rank 0 (expected at least 1)")
         is_cross = re.search(r"attn2[._](?:processor\.)?to_[kv]$", layer) is not None
         if is_cross and embedding_width not in (None, a[1]):
             what = f"made for another base model (found cross-attention {a[1]}; expected "
             advice = "give a LoRA that was trained on this model"
-            raise ModelError(where, f"{what}{embedding_width})", advice)
+            raise ModelError(path, f"{what}{embedding_width})", advice)
     _check_finite(file)
 
 
@@ -283,7 +281,7 @@ def not_a_lora(path: Path, odd: list[str], count: int) -> ModelError:
     """Return the error for a file with `count` keys, of which `odd` are no LoRA's."""
     found = f"{len(odd)} of {count} keys are foreign, such as {odd[0]!r:.80}" if odd else "no keys"
     what = f"not a LoRA of a UNet (found {found}; expected diffusers, kohya or peft keys)"
-    return ModelError(str(path), what)
+    return ModelError(path, what)
 
 
 def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
@@ -302,12 +300,12 @@ def values_hash(values: Mapping[str, NDArray[Any]], about: str = "") -> str:
 
 def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
     """Check that one of our networks has not too many values, all finite, of this `values_hash`."""
-    where, count = str(file.path), sum(map(math.prod, file.shapes.values()))
+    count = sum(map(math.prod, file.shapes.values()))
     if count > NUMBERS_MAX:
-        raise ModelError(where, f"{count} weights (expected at most {NUMBERS_MAX})")
+        raise ModelError(file.path, f"{count} weights (expected at most {NUMBERS_MAX})")
     for name, kind in file.kinds.items():
         if kind not in OURS:
-            raise ModelError(where, f"{name}: values are not finite numbers (found {kind})")
+            raise ModelError(file.path, f"{name}: values are not finite numbers (found {kind})")
     _check_finite(file)
     digest, before = hashlib.sha256(about.encode()), None
     for name, piece in _pieces(file):
@@ -315,7 +313,7 @@ def _check_written(file: WeightFile, expected: object, about: str = "") -> None:
         digest.update(piece)
         before = name
     if digest.hexdigest() != expected:
-        raise ModelError(where, "damaged (its weights are not those that were written)")
+        raise ModelError(file.path, "damaged (its weights are not those that were written)")
 
 
 def _check_finite(file: WeightFile) -> None:
@@ -325,7 +323,7 @@ def _check_finite(file: WeightFile) -> None:
             stored, bits = EXPONENTS[file.kinds[name]]
             mask = np.array(bits, stored)
             if bool(((np.frombuffer(piece, stored) & mask) == mask).any()):
-                raise ModelError(str(file.path), f"{name}: values are not finite numbers")
+                raise ModelError(file.path, f"{name}: values are not finite numbers")
 
 
 def _pieces(file: WeightFile) -> Iterator[tuple[str, bytes]]:
@@ -343,7 +341,7 @@ def _pieces(file: WeightFile) -> Iterator[tuple[str, bytes]]:
                         raise EOFError
                     yield name, piece
     except (EOFError, OSError, ValueError, LookupError) as error:  # somebody else has changed it
-        raise ModelError(str(file.path), *fault_of(file.path)) from error
+        raise ModelError(file.path, *fault_of(file.path)) from error
 
 
 def _value(file: WeightFile, name: str) -> NDArray[Any] | None:
@@ -355,7 +353,7 @@ def _value(file: WeightFile, name: str) -> NDArray[Any] | None:
             value: NDArray[Any] = content.get_tensor(name)
             return value
     except (SafetensorError, OSError, RuntimeError, TypeError, ValueError) as error:
-        raise ModelError(str(file.path), *fault_of(file.path)) from error
+        raise ModelError(file.path, *fault_of(file.path)) from error
 
 
 def _check_shapes(file: WeightFile, ours: WeightFile) -> None:
@@ -365,10 +363,10 @@ def _check_shapes(file: WeightFile, ours: WeightFile) -> None:
         found, expected = file.shapes.get(name), ours.shapes.get(name)
         if found != expected:
             what = f"{name}: shape {found} (expected {expected})"
-            raise ModelError(str(file.path), f"the weights do not fit the network; {what}")
+            raise ModelError(file.path, f"the weights do not fit the network; {what}")
 
 
-def _object(where: str, text: str) -> dict[str, Any]:
+def _object(where: Path, text: str) -> dict[str, Any]:
     """Return a JSON object of the header."""
     try:
         content = json.loads(text)

@@ -154,19 +154,19 @@ def read_lora(path: str | Path) -> Lora:
     layers = sorted({key.rsplit(".lora_", 1)[0] for key in weights})
     for key, tensor in weights.items():
         if not bool(torch.isfinite(tensor).all()):
-            raise ModelError(str(path), f"{key}: values are not finite (found nan or inf)")
+            raise ModelError(path, f"{key}: values are not finite (found nan or inf)")
     for layer in layers:
         rank = len(weights[f"{layer}.lora_A.weight"])
         try:
             alphas.setdefault(layer, _alpha(config, layer, rank))
         except (TypeError, ValueError, AttributeError) as error:
             what = "its configuration is damaged (lora_alpha, alpha_pattern)"
-            raise ModelError(str(path), what) from error
+            raise ModelError(path, what) from error
         if not math.isfinite(alphas[layer]):
-            raise ModelError(str(path), f"{layer}: alpha is not finite (found {alphas[layer]})")
+            raise ModelError(path, f"{layer}: alpha is not finite (found {alphas[layer]})")
     if set(alphas) != set(layers):
         extra = sorted(set(alphas) - set(layers))[0]
-        raise ModelError(str(path), f"an alpha without a layer (found {extra})")
+        raise ModelError(path, f"an alpha without a layer (found {extra})")
     targets = config.get("target_modules")
     partial = config.get("layers_to_transform") or config.get("exclude_modules")
     listed = isinstance(targets, list) and not partial
@@ -230,7 +230,7 @@ def _parts(path: Path, tensors: dict[str, Tensor]) -> tuple[dict[str, Tensor], d
         try:
             named, alphas = StableDiffusionLoraLoaderMixin.lora_state_dict(dict(named))
         except (KeyError, ValueError) as error:
-            raise ModelError(str(path), "its keys are not those of a whole kohya LoRA") from error
+            raise ModelError(path, "its keys are not those of a whole kohya LoRA") from error
     else:
         alphas = {key: float(v) for key, v in named.items() if key.endswith(".alpha")}
         named = {key: v for key, v in named.items() if not key.endswith(".alpha")}
@@ -262,11 +262,11 @@ def load_lora(prior: StableDiffusion, path: str | Path, name: str = "scene") -> 
         ModelError: As `read_lora`, or the LoRA belongs to another model.
     """
     lora = read_lora(path)
-    install_lora(prior, lora, name, str(path))
+    install_lora(prior, lora, name, path)
     return lora
 
 
-def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "LoRA") -> None:
+def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str | Path = "LoRA") -> None:
     """Put a LoRA beside the UNet's weights, in place of one of the same name.
 
     It is frozen and has the UNet's precision. The prior's ``adapters`` get its name; an error names
@@ -288,9 +288,9 @@ def install_lora(prior: StableDiffusion, lora: Lora, name: str, where: str = "Lo
     prior.adapters.add(name)
 
 
-def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
+def check_fit(unet: nn.Module, lora: Lora, where: str | Path) -> None:
     """Raise a ModelError unless the LoRA belongs to the UNet, whole."""
-    layers = adaptable_layers(unet)
+    layers, advice = adaptable_layers(unet), "give a LoRA that was trained on this model"
     for layer in lora.alphas:
         base = layers.get(layer)
         if base is None:
@@ -306,13 +306,11 @@ def check_fit(unet: nn.Module, lora: Lora, where: str) -> None:
         else:
             what = f"{layer}: another shape than the model's (found {list(a)}, {list(b)}; "
             what += f"expected {list(expected[0])}, {list(expected[1])})"
-        raise ModelError(where, what, "give a LoRA that was trained on this model")
+        raise ModelError(where, what, advice)
     unknown = [layer for layer in lora.alphas if layer not in layers]
     if unknown:
         found = f"{len(unknown)} of its {len(lora.alphas)} layers are not in the model, such as "
-        raise ModelError(
-            where, f"{found}{unknown[0]}", "give a LoRA that was trained on this model"
-        )
+        raise ModelError(where, f"{found}{unknown[0]}", advice)
     absent = [name for name in layers if _is_target(name, lora.targets) and name not in lora.alphas]
     if absent:
         found = f"{len(lora.alphas)} of {len(lora.alphas) + len(absent)} layers"

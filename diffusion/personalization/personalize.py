@@ -152,7 +152,7 @@ def personalize(
     key = lora_key(prior, photo, prompts, settings, seed)
     stored = cache / "lora" / f"{key}.safetensors" if cache else None
     if stored is not None and (found := _read_stored(stored, name, settings)) is not None:
-        install_lora(prior, found.lora, name, str(stored))
+        install_lora(prior, found.lora, name, stored)
         return found
     clock = _Clock(prior.device)
     embeddings = prior.embed([prompts.photo, prompts.class_])
