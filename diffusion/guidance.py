@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -160,10 +161,7 @@ class Guidance(GatedGuidance):
 
         flags = "--noises or --guidance-width"
         parts = self.prior.in_chunks(of, s.noises, "guidance", flags, self.prior.spare_memory)
-        total = next(parts)
-        for part in parts:
-            total = total + part
-        return total
+        return reduce(torch.add, parts)
 
     def with_loss(self, loss: str) -> Guidance:
         """Return the same guidance with another loss.
@@ -198,8 +196,7 @@ class Guidance(GatedGuidance):
             if self.row.k_e:
                 errors = self._delta(crops, predictions).square()
             else:
-                squares = (predictions - crops.noise).square()
-                errors = self._weighted_sum(squares)
+                errors = self._weighted_sum((predictions - crops.noise).square())
             scores.append((crops.weight * errors).sum(dim=(1, 2, 3)))
         score = float(torch.cat(scores).mean())
         return score if math.isfinite(score) else None
@@ -218,18 +215,13 @@ class Guidance(GatedGuidance):
             end: Same shape.
             draws: Seeds; none of them is a step's.
         """
-        s = self.settings
-        generators = [generator_of(self.seed, "work", draw) for draw in draws]
+        count = self.settings.noises
         found: list[float] = []
-        for k in range(0, len(draws), s.noises):
-            batch = generators[k : k + s.noises]
-            t = torch.cat([self._time_of_a_run(g) for g in batch])
-            # Each picture meets the same crops and noises.
-            states = [g.get_state() for g in batch]
+        for k in range(0, len(draws), count):
             crops = []
-            for image in (middle, start, end):
-                for g, state in zip(batch, states, strict=True):
-                    g.set_state(state)
+            for image in (middle, start, end):  # each meets the same times, crops and noises
+                batch = [generator_of(self.seed, "work", draw) for draw in draws[k : k + count]]
+                t = torch.cat([self._time_of_a_run(g) for g in batch])
                 crops.append(self._noisy_crops(image, t, batch))
             residual = crops[0].weight * self._delta(crops[0], self._predictions(crops[0]))
             way = (crops[2].latents - crops[1].latents).double()

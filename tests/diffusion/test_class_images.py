@@ -230,21 +230,16 @@ def test_a_damaged_file_is_made_again(tmp_path: Path, fault: str) -> None:
     """With a notice that names it; a flipped bit that decoders forgive counts too."""
     whole = make_class_images(Painter(), PROMPTS, SETTINGS, 0, tmp_path)
     file = sorted(tmp_path.iterdir())[2]
-    content = bytearray(file.read_bytes())
-    if fault == "empty":
-        content = bytearray()
-    elif fault == "cut":
-        content = content[: len(content) // 2]
-    elif fault == "junk":
-        content = bytearray(b"junk" * 100)
-    elif fault == "flipped":
-        content[content.index(b"IDAT") + 100] ^= 1
-    if fault == "other size":
-        Image.new("RGB", (8, 8)).save(file)
-    elif fault == "other picture":
-        Image.new("RGB", (16, 16)).save(file)
+    content = file.read_bytes()
+    flipped = bytearray(content)
+    flipped[content.index(b"IDAT") + 100] ^= 1
+    contents = {"cut": content[: len(content) // 2], "flipped": flipped}
+    contents |= {"empty": b"", "junk": b"junk" * 100}
+    if fault in contents:
+        file.write_bytes(contents[fault])
     else:
-        file.write_bytes(content)
+        side = 8 if fault == "other size" else 16
+        Image.new("RGB", (side, side)).save(file)
     again = make_class_images(Painter(), PROMPTS, SETTINGS, 0, tmp_path)
     assert again.made == 1
     assert len(again.notices) == 1

@@ -47,10 +47,9 @@ MASK = torch.ones(4, 4)
 """Of an object so small that every crop of 4 x 4 pixels is the whole picture."""
 
 
-def schedule(prediction_type: str = "epsilon") -> NoiseSchedule:
-    """Return Stable Diffusion's: scaled linear from .00085 to .012."""
-    root = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64)
-    return NoiseSchedule(torch.cumprod(1.0 - root**2, dim=0), prediction_type)
+ROOTS = torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64)
+SCHEDULE = NoiseSchedule(torch.cumprod(1.0 - ROOTS**2, dim=0), "epsilon")
+"""Stable Diffusion's: scaled linear from .00085 to .012."""
 
 
 @dataclass
@@ -70,10 +69,9 @@ class GaussianPrior:
     Pictures are their own latents. Each (prompt, adapter) has a mean; all share one variance.
     """
 
-    device = torch.device("cpu")
+    device, schedule = torch.device("cpu"), SCHEDULE
 
     resolution: int = 4
-    prediction_type: str = "epsilon"
     variance: float = 0.3
     adapter_shift: float = 0.25
     """What the adapter adds to the means."""
@@ -87,9 +85,6 @@ class GaussianPrior:
 
     def spare_memory(self) -> None:
         """There is nothing to free."""
-
-    def __post_init__(self) -> None:
-        self.schedule = schedule(self.prediction_type)
 
     def mean(self, prompt: str, adapter: str | None) -> Tensor:
         """Return the mean picture, shape [3, R, R]."""
@@ -120,15 +115,7 @@ class GaussianPrior:
         assert len(latents_noisy) == len(t) == len(prompts) == len(adapters)
         self.calls.append(Call(latents_noisy, t, prompts, list(adapters)))
         samples = zip(latents_noisy, t, prompts, adapters, strict=True)
-        noise = torch.stack([self.noise(*sample) for sample in samples])
-        # A network of the other kinds would say the same in its own way.
-        a, s = (x.view(-1, 1, 1, 1) for x in self.schedule.alpha_sigma(t))
-        said = {
-            "epsilon": noise,
-            "v_prediction": (noise - s * latents_noisy) / a,
-            "sample": (latents_noisy - s * noise) / a,
-        }[self.prediction_type]
-        return self.schedule.to_noise(said, latents_noisy, t)
+        return torch.stack([self.noise(*sample) for sample in samples])
 
 
 def picture(rng: np.random.Generator, height: int = 4, width: int = 4) -> Tensor:
@@ -163,14 +150,11 @@ def literal_delta(loss: str, g: float, e: dict[str, Tensor], noise: Tensor) -> T
     }[loss]()
 
 
-@pytest.mark.parametrize("prediction_type", ["epsilon", "v_prediction", "sample"])
 @pytest.mark.parametrize("noises", [1, 3])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_row_is_its_printed_formula(
-    rng: np.random.Generator, loss: str, noises: int, prediction_type: str
-) -> None:
-    """w(t) times the literal residual, mean over the noises, for networks of all three kinds."""
-    prior = GaussianPrior(prediction_type=prediction_type)
+def test_row_is_its_printed_formula(rng: np.random.Generator, loss: str, noises: int) -> None:
+    """w(t) times the literal residual, mean over the noises."""
+    prior = GaussianPrior()
     x = picture(rng)
     settings = replace(ASKED, loss=loss, noises=noises, guidance_scale=7.5)
     found = guidance(prior, settings).gradient(x, step=5)
@@ -327,7 +311,7 @@ def test_weight_scales_the_gradient(
     found = guidance(
         GaussianPrior(), at_time(0.4, weight=name, literal_alpha=literal_alpha)
     ).gradient(x, 0)
-    bar = float(schedule().alphas_cumprod[400])
+    bar = float(SCHEDULE.alphas_cumprod[400])
     w = {"sigma2": 1 - bar, "sigma": math.sqrt(1 - bar), "uniform": 1.0}[name]
     assert unit is not None
     torch.testing.assert_close(

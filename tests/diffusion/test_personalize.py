@@ -4,6 +4,7 @@ import gc
 import hashlib
 import weakref
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -259,9 +260,11 @@ def test_predictions_that_are_not_finite_end_the_run(
 
 @pytest.fixture
 def training(prior: StableDiffusion) -> Iterator[LoraTraining]:
-    yield from make_training(prior, SETTINGS)
+    with make_training(prior, SETTINGS) as made:
+        yield made
 
 
+@contextmanager
 def make_training(
     prior: StableDiffusion, settings: PersonalizeSettings, seed: int = 0
 ) -> Iterator[LoraTraining]:
@@ -297,7 +300,7 @@ def test_long_gradients_are_shortened_to_one(epsilon: StableDiffusion) -> None:
     """Losses of a thousandfold weight have gradients that much longer; shorter ones stay."""
     norms = []
     for weight in (1.0, 1000.0):
-        for training in make_training(epsilon, replace(SETTINGS, lora_class_weight=weight)):
+        with make_training(epsilon, replace(SETTINGS, lora_class_weight=weight)) as training:
             training.prepare(0)
             training.update()
             gradients = [p.grad.flatten() for p in training.parameters.values()]
@@ -308,7 +311,7 @@ def test_long_gradients_are_shortened_to_one(epsilon: StableDiffusion) -> None:
 
 def test_a_step_asks_for_the_right_thing(prior: StableDiffusion) -> None:
     """Losses restated through the prior: the photo's prompt for the crop, the class' for others."""
-    for training in make_training(prior, SETTINGS):
+    with make_training(prior, SETTINGS) as training:
         for step in range(3):
             training.prepare(step)
             training.update()
@@ -328,7 +331,7 @@ def test_the_class_weight_weighs_the_class(epsilon: StableDiffusion) -> None:
     """Gradients before clipping are linear in the weight: their directions show it."""
     gradients = []
     for weight in (0.0, 1.0, 2.0):
-        for training in make_training(epsilon, replace(SETTINGS, lora_class_weight=weight)):
+        with make_training(epsilon, replace(SETTINGS, lora_class_weight=weight)) as training:
             training.prepare(0)
             training.update()
             found = [p.grad.flatten() for k, p in training.parameters.items() if ".lora_B." in k]
@@ -543,14 +546,9 @@ def test_a_damaged_lora_is_trained_again(
 ) -> None:
     first = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, tmp_path)
     (file,) = (tmp_path / "lora").iterdir()
-    if fault == "cut":
-        file.write_bytes(file.read_bytes()[:-50])
-    elif fault == "junk":
-        file.write_bytes(b"junk")
-    else:
-        content_of = bytearray(file.read_bytes())
-        content_of[-9] ^= 1
-        file.write_bytes(content_of)
+    flipped = bytearray(file.read_bytes())
+    flipped[-9] ^= 1
+    file.write_bytes({"cut": file.read_bytes()[:-50], "junk": b"junk", "one bit": flipped}[fault])
     take_notices()
     again = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, tmp_path)
     assert not again.is_reused
