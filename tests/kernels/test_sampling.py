@@ -213,37 +213,7 @@ def test_lobe_sample_million(
     assert verdict.passed, verdict
 
 
-@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
-def test_lobe_mean_cosine(device: str, rng: np.random.Generator, sharpness: float) -> None:
-    """The mean of ``1 - cos`` is ``1 / s - 2 / (exp(2 s) - 1)``."""
-    axis = o.normalize([0.48, -0.6, 0.64]).astype(np.float32)
-    d = draw_lobe(axis, sharpness, rng, device, SAMPLE_COUNT)
-    t = o.one_minus_cos(d, axis)
-    expected = 1.0 / sharpness - (2.0 / np.expm1(2.0 * sharpness) if sharpness < 300 else 0.0)
-    error = np.std(t) / np.sqrt(SAMPLE_COUNT)
-    assert abs(np.mean(t) - expected) < Z_MAX * error
-
-
 # --------------------------------------------------------------------------- light: values
-
-
-@pytest.mark.parametrize("sharpness", LOBE_SHARPNESS)
-def test_lobe_density_matches_oracle(
-    device: str, rng: np.random.Generator, sharpness: float
-) -> None:
-    """One lobe's proposal density equals the float64 density where it matters."""
-    lobes = Lobes(
-        np.ones((1, 3), np.float32),
-        np.array([[0.48, -0.6, 0.64]], np.float32),
-        np.array([sharpness], np.float32),
-    )
-    light = light_args(Light(lobes), wp.get_device(device))
-    wi = draw_light(light, rng, device, 20000).astype(np.float32)
-    radiance, pdf = eval_light(light, wi, device)
-    expected = o.sg_pdf(wi, lobes.axis[0], lobes.sharpness[0])
-    np.testing.assert_allclose(pdf, expected, rtol=PDF_RTOL)
-    shape = o.sg_radiance(wi, lobes.amplitude, lobes.axis, lobes.sharpness)
-    np.testing.assert_allclose(radiance, shape, rtol=PDF_RTOL)
 
 
 def test_light_radiance_is_lobes_plus_map(device: str, rng: np.random.Generator) -> None:
