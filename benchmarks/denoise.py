@@ -19,7 +19,7 @@ from benchmarks.scenes import panoramas_of, photo_of, places_of, renderer_of
 from warpir.core.arrays import FloatArray
 from warpir.evaluate.scenes import Subject
 from warpir.render.composite import Picture, make_picture
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
 
@@ -33,11 +33,10 @@ def measure(subject: Subject, reference: int) -> list[dict[str, float | str]]:
     """Return errors and seconds of every number of samples, with and without the denoiser."""
     renderer, photo = renderer_of(subject), photo_of(subject.place.photo)
     light, curves = Light(texels=subject.place.texels), Curves.identity("linear")
-    knots = curves.foreground, curves.shadow_ratio
 
     def insert(samples: int, seed: int, is_denoised: bool) -> Picture:
         quality = Quality(samples, 1, 5, seed, 8.0, is_denoised)
-        return make_picture(renderer, light, light, photo, quality, *knots, is_reinhard=False)
+        return make_picture(renderer, light, light, photo, quality, curves)
 
     truth = insert(reference, 1, is_denoised=False)
     inside = truth.layers.matte > 0.5

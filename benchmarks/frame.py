@@ -18,11 +18,11 @@ from warpir.io.assets import load_asset
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.render.composite import make_picture
 from warpir.render.device import choose_device
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light
 from warpir.scene.placement import place_asset
-from warpir.scene.tone_curves import ToneKnots
+from warpir.scene.tone_curves import Curves
 
 
 def main() -> None:
@@ -48,10 +48,10 @@ def main() -> None:
     device = choose_device(options.device)
     renderer = on_the_ground(asset, placement.asset_to_world, camera, device)
     quality = Quality(options.samples, 1, options.depth, 0)
-    curves = ToneKnots.identity(1), ToneKnots.identity(3)
+    curves = Curves.identity("reinhard")
     times = []
     for _ in range(1 + options.repeats):
-        picture = make_picture(renderer, light, light, photo, quality, *curves)
+        picture = make_picture(renderer, light, light, photo, quality, curves)
         times.append(time.perf_counter() - start)
         start = time.perf_counter()
     report(

@@ -37,7 +37,8 @@ from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, gaussian
 from warpir.render.composite import composite
-from warpir.render.picture.planes import Quality, Rendering, render
+from warpir.render.picture.planes import Rendering, render
+from warpir.render.picture.quality import Quality
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
@@ -194,10 +195,8 @@ def _rendered(subject: Subject, samples: int) -> tuple[Rendering, Rendering]:
     """Return the object under the place's own light, twice, by other samples."""
     renderer = renderer_of(subject)
     light, curves = Light(texels=subject.place.texels), Curves.identity("linear")
-    knots = curves.foreground, curves.shadow_ratio
     first, second = (
-        render(renderer, light, light, Quality(samples, 1, 5, seed, 8.0), *knots, is_reinhard=False)
-        for seed in (1, 2)
+        render(renderer, light, light, Quality(samples, 1, 5, seed, 8.0), curves) for seed in (1, 2)
     )
     return first, second
 

@@ -28,7 +28,7 @@ from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import load_regressor
 from warpir.render.device import choose_device
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, as_map

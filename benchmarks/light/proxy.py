@@ -35,7 +35,7 @@ from warpir.render.composite import make_picture
 from warpir.render.device import choose_device
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.picture.photo_scene import photo_radiance
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera, camera_from_fov
@@ -44,7 +44,7 @@ from warpir.scene.light import Light, angles_from_axis
 from warpir.scene.placement import Placement, place_asset
 from warpir.scene.receiver import ReceiverMesh, first_hit, mesh_of
 from warpir.scene.shadow_mask import shadow_mask
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 
 DEPTH = 4
 GROUND = 40.0
@@ -193,11 +193,11 @@ class Yard:
         Wall and ground together make the plane needless.
         """
         plain = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-        radiance = photo_radiance(photo, Curves.identity("linear"))
+        curves = Curves.identity("linear")
+        radiance = photo_radiance(photo, curves)
         wall, whole = (replace(plain, mesh=mesh, radiance=radiance) for mesh in self.meshes)
         placed = Placed(self.car, placement.asset_to_world)
         shade = shadow_mask(mask, *self.car.bounds(), placed.asset_to_world, self.camera)
-        curves = ToneKnots.identity(1), ToneKnots.identity(3)
         quality = Quality(self.samples // 2, 1, DEPTH, 0)
         found = {}
         for name, proxy, own_mask in (
@@ -209,7 +209,7 @@ class Yard:
             scene = Scene([placed], self.camera, proxy, device)
             for _ in range(2):
                 start = time.perf_counter()
-                given = light, light, photo, quality, *curves, False
+                given = light, light, photo, quality, curves
                 picture = make_picture(Renderer(scene), *given, shadow_mask=own_mask)
                 seconds = time.perf_counter() - start
             found[name] = (np.clip(picture.image, 0.0, 1.0), seconds)

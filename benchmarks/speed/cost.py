@@ -24,7 +24,8 @@ from benchmarks.scenes import on_the_ground
 from benchmarks.speed.scenes import sun_and_sky, uv_ball
 from warpir.core.memory import core_count
 from warpir.render.device import choose_device
-from warpir.render.picture.planes import Quality, render
+from warpir.render.picture.planes import render
+from warpir.render.picture.quality import Quality
 from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import camera_from_fov
 from warpir.scene.light import Light, rasterize_lobes
@@ -66,7 +67,7 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
 
     def picture(seed: int, count: int) -> None:
         quality = Quality(count, 1, DEPTH, seed)
-        render(own, light, light, quality, curves.foreground, curves.shadow_ratio)
+        render(own, light, light, quality, curves)
         wp.synchronize_device(own.device)
 
     start = time.perf_counter()

@@ -37,7 +37,7 @@ from warpir.evaluate.scenes import (
 )
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.io.results import OutputFolder
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.scene.camera import CameraEstimate
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves

@@ -1,5 +1,6 @@
 """COLMAP, nerfstudio, Waymo, glTF and EXR cameras against their own formulas, and bad files."""
 
+import json
 import struct
 from collections.abc import Callable
 from functools import partial

@@ -47,7 +47,7 @@ from warpir.render.bridge import ShadeForeground
 from warpir.render.composite import make_picture
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.mis.samples import ObjectSamples
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.asset import Asset, Material
@@ -244,8 +244,7 @@ def test_loops_see_what_is_delivered(device: str, rng: np.random.Generator) -> N
     photo = replace(some_photo(), codes=some_photo().codes.astype(np.uint16))
     picture = make_picture(
         frame.renderer, light.light, light.light_shadow, photo,
-        Quality(STILL_SAMPLES, 1, frame.depth, frame.seed),
-        light.curves.foreground, light.curves.shadow_ratio,
+        Quality(STILL_SAMPLES, 1, frame.depth, frame.seed), light.curves,
     )  # fmt: skip
     with torch.no_grad():
         image = loop.final_image(0)[0].permute(1, 2, 0).cpu().numpy()

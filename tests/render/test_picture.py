@@ -1,6 +1,8 @@
 """From radiance to the picture: both composites agree, parts add up, resizing, ball preview."""
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,14 +24,14 @@ from warpir.render.composite import Picture, make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.picture.light_preview import balls
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
-from warpir.render.shadow.picture import ShadowSamples, picture_ratio
+from warpir.render.shadow.picture import picture_ratio
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Material
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, axis_from_angles, plain_sky
-from warpir.scene.tone_curves import ToneKnots
+from warpir.scene.tone_curves import Curves, ToneKnots
 
 COMPOSITE = 1e-5
 """Largest difference of two composites of the same numbers, display-encoded: the task's figure."""
@@ -41,6 +43,7 @@ FILTER_TAIL = 1e-6
 """What the Gaussian of a reduction still weighs four standard deviations away."""
 QUALITY = Quality(samples=8, rays=1, depth=3, seed=5)
 VIEW = camera(48, 32, 48.0, (0.0, 1.2, 0.0), -12.0)
+PLAIN = Curves.identity("reinhard")
 
 
 def photo(height: int = 32, width: int = 48) -> Photo:
@@ -67,8 +70,12 @@ def sunny() -> Light:
     return Light(lobe((0.6, 0.7, 0.3), 400.0, (60.0, 50.0, 40.0)).lobes, sky)
 
 
-def bent(curves: int, seed: int) -> ToneKnots:
+def bent(tone: str = "reinhard") -> Curves:
     """Random tone curves."""
+    return Curves(tone, bent_knots(1, 1), bent_knots(3, 2))
+
+
+def bent_knots(curves: int, seed: int) -> ToneKnots:
     generator = torch.Generator().manual_seed(seed)
     curve = ToneCurve(curves)
     with torch.no_grad():
@@ -84,43 +91,38 @@ def tensors(knots: ToneKnots) -> Knots:
 
 def picture(
     device: str,
-    curves: tuple[ToneKnots, ToneKnots] | None = None,
-    is_reinhard: bool = True,
+    curves: Curves = PLAIN,
     view: Camera = VIEW,
-    of: Photo | None = None,
+    quality: Quality = QUALITY,
+    **more: Any,
 ) -> Picture:
     """A finished picture of `renderer` under `sunny`."""
     light = sunny()
-    knots = curves or (ToneKnots.identity(1), ToneKnots.identity(3))
-    return make_picture(
-        renderer(device, view), light, light, of or photo(), QUALITY, *knots, is_reinhard
-    )
+    return make_picture(renderer(device, view), light, light, photo(), quality, curves, **more)
 
 
-@pytest.mark.parametrize("is_reinhard", [True, False], ids=["reinhard", "linear"])
-@pytest.mark.parametrize("bend", [False, True], ids=["identity", "curves"])
+@pytest.mark.parametrize("tone", ["reinhard", "linear"])
+@pytest.mark.parametrize("made", [Curves.identity, bent], ids=["identity", "curves"])
 def test_picture_equals_the_differentiable_composite(
-    device: str, is_reinhard: bool, bend: bool
+    device: str, tone: str, made: Callable[[str], Curves]
 ) -> None:
     """The final picture and the composite of the loop agree on the same radiance (B4, B5)."""
-    curves = (bent(1, 1), bent(3, 2)) if bend else (ToneKnots.identity(1), ToneKnots.identity(3))
-    final = picture(device, curves, is_reinhard)
+    curves = made(tone)
+    final = picture(device, curves)
     r, light = renderer(device), sunny()
     args = light_args(light, r.device)
     objects = r.gbuffer(QUALITY.seed).object_pixels
     out = r.foreground(args, objects, QUALITY.samples, QUALITY.rays, QUALITY.depth, QUALITY.seed)
-    coverage, sees = (
-        np.zeros(VIEW.width * VIEW.height),
-        np.zeros(VIEW.width * VIEW.height, np.int32),
-    )
+    coverage = np.zeros(VIEW.width * VIEW.height)
+    sees = np.zeros(VIEW.width * VIEW.height, np.int32)
     coverage[objects], sees[objects] = out.mask, 1
-    samples = ShadowSamples(QUALITY.samples, QUALITY.rays, QUALITY.seed, QUALITY.indirect_limit)
-    shaded, ratio = picture_ratio(r, args, sees, coverage < 1.0, samples)
+    shaded, ratio = picture_ratio(r, args, sees, coverage < 1.0, QUALITY)
+    is_reinhard = tone == "reinhard"
     constants = ComposeConstants(photo().linear(), objects, shaded, out.mask, device, is_reinhard)
     image = compose(
         constants,
         *(torch.from_numpy(x) for x in (out.radiance, ratio, np.ones_like(ratio))),
-        *(tensors(k) for k in curves),
+        *(tensors(k) for k in (curves.foreground, curves.shadow_ratio)),
     )
     found = image[0].permute(1, 2, 0).numpy()
     assert found.shape == final.image.shape
@@ -130,7 +132,7 @@ def test_picture_equals_the_differentiable_composite(
 
 def test_picture_is_recomputed_from_its_layers(device: str) -> None:
     """Composite = fg + (1 - a) plate ratio, and the image is its encoding (method 2.13, M 6)."""
-    final = picture(device, (bent(1, 1), bent(3, 2)))
+    final = picture(device, bent())
     layers = final.layers
     alpha = layers.foreground[..., 3]
     straight = layers.foreground[..., :3] / np.maximum(alpha, 1e-9)[..., None]
@@ -149,11 +151,7 @@ def test_i20_occluder_keeps_the_photo_in_front(device: str) -> None:
     rows = 12
     assert free.layers.matte[rows:].max() == 1.0 and free.changed[rows + 5 :].any()
     occluder[rows : rows + 5], occluder[rows + 5 :] = ramp, 1.0
-    light = sunny()
-    knots = (ToneKnots.identity(1), ToneKnots.identity(3))
-    behind = make_picture(
-        renderer(device), light, light, photo(), QUALITY, *knots, occluder=occluder
-    )
+    behind = picture(device, occluder=occluder)
     m = occluder[..., None]
     expected = m * free.layers.plate + (1.0 - m) * free.layers.composite
     np.testing.assert_allclose(behind.layers.composite, expected, atol=COMPOSITE)
@@ -176,24 +174,24 @@ def test_i20_occluder_keeps_the_photo_in_front(device: str) -> None:
 
 def test_foreground_is_the_tone_mapped_radiance(device: str) -> None:
     """Reinhard, then the curve, of radiance over coverage (method 2.4), in float64."""
-    knots = bent(1, 1)
-    layers = picture(device, (knots, ToneKnots.identity(3))).layers
+    curves = bent()
+    layers = picture(device, curves).layers
     r = renderer(device)
     objects = r.gbuffer(QUALITY.seed).object_pixels
     args = light_args(sunny(), r.device)
     out = r.foreground(args, objects, QUALITY.samples, QUALITY.rays, QUALITY.depth, QUALITY.seed)
     seen = out.mask > 0.0
     mask = out.mask[seen, None]
-    x, y, slope = (k[0].astype(np.float64) for k in knots.arrays())
+    x, y, slope = (k[0].astype(np.float64) for k in curves.foreground.arrays())
     shown, _ = spline(reinhard(out.radiance[seen] / mask), x, y, slope)
     found = layers.foreground.reshape(-1, 4)[objects[seen], :3]
     np.testing.assert_allclose(found, mask * shown, atol=COMPOSITE)
 
 
-@pytest.mark.parametrize("is_reinhard", [True, False], ids=["reinhard", "linear"])
-def test_parts_add_up_to_the_foreground(device: str, is_reinhard: bool) -> None:
+@pytest.mark.parametrize("tone", ["reinhard", "linear"])
+def test_parts_add_up_to_the_foreground(device: str, tone: str) -> None:
     """Diffuse + specular + emission = foreground, each at least 0, each where it should be."""
-    layers = picture(device, (bent(1, 1), bent(3, 2)), is_reinhard).layers
+    layers = picture(device, bent(tone)).layers
     assert layers.diffuse is not None and layers.specular is not None
     assert layers.emission is not None
     total = layers.diffuse + layers.specular + layers.emission
@@ -237,10 +235,8 @@ def test_geometry_layers_describe_the_surface(device: str) -> None:
 
 def test_blur_response_and_grain_recompose(device: str) -> None:
     """The layers add up with a camera's look too, and what did not change keeps its codes."""
-    light, knots = sunny(), (ToneKnots.identity(1), ToneKnots.identity(3))
     look = CameraLook(EdgeBlur(1.0, 0), Grain((0.5,), ((0.02,) * 3,), 0.5, 0.3), Response(1.2))
-    plain = make_picture(renderer(device), light, light, photo(), QUALITY, *knots)
-    final = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
+    plain, final = picture(device), picture(device, look=look)
     layers = final.layers
     assert layers.grain is not None and np.abs(layers.grain).max() > 0.01
     added = layers.foreground[..., :3] + layers.grain
@@ -253,18 +249,16 @@ def test_blur_response_and_grain_recompose(device: str) -> None:
     # The outline is softer, and no coverage is lost.
     assert layers.matte.sum() == pytest.approx(plain.layers.matte.sum(), rel=0.01)
     assert (layers.matte == 1.0).sum() < (plain.layers.matte == 1.0).sum()
-    again = make_picture(renderer(device), light, light, photo(), QUALITY, *knots, look=look)
-    np.testing.assert_array_equal(again.image, final.image)
+    np.testing.assert_array_equal(picture(device, look=look).image, final.image)
 
 
 @pytest.mark.skipif(denoiser_version() is None, reason="pyoidn is not installed")
 def test_denoised_picture_is_nearer_to_the_truth(device: str) -> None:
     """Less error on object and shadow; layers recompose, parts add up, other pixels keep codes."""
-    light, knots = sunny(), (ToneKnots.identity(1), ToneKnots.identity(3))
 
     def final(samples: int, is_denoised: bool) -> Picture:
         quality = replace(QUALITY, samples=samples, is_denoised=is_denoised)
-        return make_picture(renderer(device), light, light, photo(), quality, *knots)
+        return picture(device, quality=quality)
 
     truth, noisy, clean = final(512, False), final(8, False), final(8, True)
     for where in (truth.layers.matte > 0.5, truth.changed & (truth.layers.matte == 0.0)):
@@ -350,8 +344,7 @@ def test_object_away_from_the_frame_leaves_the_photo(device: str) -> None:
     """Nothing of the object and no shadow in view: the composite is the photo."""
     far = placed(box((500.0, 0.5, -4.0), (1.0, 1.0, 1.0)))
     away = Renderer(Scene([far], VIEW, ground(0.0), device))
-    knots = ToneKnots.identity(1), ToneKnots.identity(3)
-    final = make_picture(away, sunny(), sunny(), photo(), QUALITY, *knots)
+    final = make_picture(away, sunny(), sunny(), photo(), QUALITY, PLAIN)
     assert not final.changed.any()
     np.testing.assert_array_equal(final.layers.composite, photo().linear())
     np.testing.assert_array_equal(photo().encode(final.image, final.changed), photo().codes)
@@ -359,19 +352,15 @@ def test_object_away_from_the_frame_leaves_the_photo(device: str) -> None:
 
 def test_two_lights_serve_object_and_shadow_apart(device: str) -> None:
     """The first light colours the object alone, the second the shadow alone."""
-    knots = ToneKnots.identity(1), ToneKnots.identity(3)
     dark = constant((0.0, 0.0, 0.0))
     side = lobe((-0.8, 0.6, 0.1), 1e4, (1e3, 1e3, 1e3))
-    both, only_shadow = (
-        make_picture(renderer(device, glow=0.0), fg, side, photo(), QUALITY, *knots).layers
-        for fg in (sunny(), dark)
+    both, only_shadow, other = (
+        make_picture(renderer(device, glow=0.0), *lights, photo(), QUALITY, PLAIN).layers
+        for lights in ((sunny(), side), (dark, side), (sunny(), sunny()))
     )
     np.testing.assert_array_equal(both.shadow_ratio, only_shadow.shadow_ratio)
     np.testing.assert_array_equal(only_shadow.foreground[..., :3], 0.0)
     np.testing.assert_array_equal(only_shadow.matte, both.matte)
-    other = make_picture(
-        renderer(device, glow=0.0), sunny(), sunny(), photo(), QUALITY, *knots
-    ).layers
     np.testing.assert_array_equal(other.foreground, both.foreground)
     assert not np.array_equal(other.shadow_ratio, both.shadow_ratio)
 
@@ -438,8 +427,7 @@ def test_card_in_front_of_its_own_shadow(device: str) -> None:
     card = placed(quad((0.07, 1.0, -4.0), (0.8, 0, 0), (0, 0.6, 0)))
     r = Renderer(Scene([card], VIEW, ground(0.0), device))
     light = lobe((0.0, 1.0, 0.0), 1e5, (1e4, 1e4, 1e4))
-    knots = ToneKnots.identity(1), ToneKnots.identity(3)
-    layers = make_picture(r, light, light, photo(), QUALITY, *knots).layers
+    layers = make_picture(r, light, light, photo(), QUALITY, PLAIN).layers
     half = (layers.matte > 0.0) & (layers.matte < 1.0)
     assert half.any()
     np.testing.assert_array_equal(layers.shadow_ratio[half], 1.0)

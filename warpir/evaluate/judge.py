@@ -18,7 +18,7 @@ from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Bench, Prediction, Stage
 from warpir.evaluate.three_spheres import sphere_errors
 from warpir.lighting.regressor import split
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.scene.light import as_map
 from warpir.train.lights import load_panoramas
 from warpir.train.networks.regressor import RegressorModule

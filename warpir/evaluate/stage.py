@@ -27,7 +27,8 @@ from warpir.lighting.regressor import Regressor
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
-from warpir.render.picture.planes import Quality, spread
+from warpir.render.picture.planes import spread
+from warpir.render.picture.quality import Quality
 from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, Renderer
 from warpir.render.shadow.pilot import shaded_pixels
@@ -147,14 +148,8 @@ class Stage:
             linear = radiance / np.where(seen, foreground.mask[:, None], 1.0)
             response = RESPONSES[self.place.response]
             return response.show(linear.astype(np.float64)).astype(np.float32)
-        shown, _ = tone_mapped(
-            self.renderer,
-            replace(foreground, radiance=radiance),
-            rendered.ratio[:0],
-            curves.foreground,
-            curves.shadow_ratio,
-            curves.tone == "reinhard",
-        )
+        lit = replace(foreground, radiance=radiance)
+        shown, _ = tone_mapped(self.renderer, lit, rendered.ratio[:0], curves)
         return shown
 
     def _behind(self, rendered: Rendered, curves: Curves | None) -> FloatArray:
@@ -167,14 +162,7 @@ class Stage:
             lit = response.invert(behind[proxies].astype(np.float64))
             behind[proxies] = response.show(lit * rendered.ratio).astype(np.float32)
         else:
-            _, ratio = tone_mapped(
-                self.renderer,
-                rendered.foreground,
-                rendered.ratio,
-                curves.foreground,
-                curves.shadow_ratio,
-                curves.tone == "reinhard",
-            )
+            _, ratio = tone_mapped(self.renderer, rendered.foreground, rendered.ratio, curves)
             behind[proxies] *= ratio
         return behind
 

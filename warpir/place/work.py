@@ -84,7 +84,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     """
     from warpir.render.composite import make_picture
     from warpir.render.device import keep_kernels
-    from warpir.render.picture.planes import Quality
+    from warpir.render.picture.quality import Quality
 
     config = InsertConfig(**read_values(job["config"]))
     inputs, lit, renderer = _prepared(config, int(job["width"]), say)
@@ -94,9 +94,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
         lit.light_shadow,
         inputs.photo,
         Quality(PREVIEW_SAMPLES, 1, PREVIEW_DEPTH, config.render.seed, PREVIEW_LIMIT),
-        lit.curves.foreground,
-        lit.curves.shadow_ratio,
-        is_reinhard=lit.curves.tone == "reinhard",
+        lit.curves,
         occluder=inputs.occluder,
     )
     keep_kernels()  # this process may be killed

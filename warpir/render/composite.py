@@ -12,13 +12,14 @@ from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX, Layers
 from warpir.look.camera_look import CameraLook
 from warpir.look.sharpness import shown_box
-from warpir.render.picture.planes import Quality, Rendering, blank, render
+from warpir.render.picture.planes import Rendering, blank, render
+from warpir.render.picture.quality import Quality
 from warpir.render.picture.resizing import resize_planes
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.mirror import leaving_ground, shown_mirror
 from warpir.scene.light import Light
 from warpir.scene.shadow_mask import ShadowMask
-from warpir.scene.tone_curves import ToneKnots
+from warpir.scene.tone_curves import Curves
 
 UNCHANGED = CameraLook()
 """Look of a camera that neither blurs nor has noise."""
@@ -57,9 +58,7 @@ def make_picture(
     light_shadow: Light,
     photo: Photo,
     quality: Quality,
-    curve_fg: ToneKnots,
-    curve_shadow: ToneKnots,
-    is_reinhard: bool = True,
+    curves: Curves,
     *,
     occluder: FloatArray | None = None,
     shadow_mask: ShadowMask | None = None,
@@ -70,23 +69,9 @@ def make_picture(
 
     The arguments are those of `render` and `composite`.
     """
-    return composite(
-        render(
-            renderer,
-            light_fg,
-            light_shadow,
-            quality,
-            curve_fg,
-            curve_shadow,
-            is_reinhard,
-            shadow_mask=shadow_mask,
-            behind=behind,
-        ),
-        photo,
-        quality.seed,
-        occluder,
-        look,
-    )
+    lights = light_fg, light_shadow
+    rendering = render(renderer, *lights, quality, curves, shadow_mask=shadow_mask, behind=behind)
+    return composite(rendering, photo, quality.seed, occluder, look)
 
 
 def composite(

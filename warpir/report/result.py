@@ -24,7 +24,7 @@ from warpir.look.denoise import denoiser_version
 from warpir.render.composite import UNCHANGED, Picture, make_picture
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.photo_scene import scene_of
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.report.page import Results
 from warpir.report.pictures import shrink
@@ -160,9 +160,7 @@ def _picture(
             is_denoised=quality.denoise == "auto" and denoiser_version() is not None,
             ground_roughness=quality.coat_roughness,
         ),
-        light.curves.foreground,
-        light.curves.shadow_ratio,
-        is_reinhard=light.curves.tone == "reinhard",
+        light.curves,
         occluder=inputs.occluder,
         shadow_mask=inputs.shadow_mask,
         look=look,

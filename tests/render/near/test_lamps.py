@@ -19,8 +19,9 @@ from warpir.core.arrays import Float64Array
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.mis.integrator import MisIntegrator
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Foreground, ReceiverRadiance, Renderer
-from warpir.render.shadow.picture import ShadowSamples, picture_ratio
+from warpir.render.shadow.picture import picture_ratio
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.scene.asset import Material
@@ -274,8 +275,8 @@ def test_lamps_shade_a_picture_by_the_pixel(device: str) -> None:
     thing = placed(sphere((0.0, 0.6, 0.0), 0.4, 3))
     r = renderer(thing, [lamp], view, device)
     args, count = light_args(constant((0.3, 0.3, 0.3)), r.device), len(all_pixels(view))
-    sees, samples = np.ones(count, np.int32), ShadowSamples(64, 1, 5, 0.0)
-    pixels, ratio = picture_ratio(r, args, sees, np.ones(count, np.bool_), samples)
+    sees, quality = np.ones(count, np.int32), Quality(64, 1, 1, 5)
+    pixels, ratio = picture_ratio(r, args, sees, np.ones(count, np.bool_), quality)
     both = receiver(r, constant((0.3, 0.3, 0.3)), seed=9)
     exact = r.ratio(both)
     assert ratio.min() < 0.3

@@ -1,5 +1,6 @@
 """The object's mirror image on a glossy ground: closed forms, quadrature, the picture's layer."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -7,16 +8,16 @@ import pytest
 
 from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, constant, ground, placed, sphere
-from tests.render.test_picture import QUALITY, bent, photo, renderer, sunny
+from tests.render.test_picture import QUALITY, bent, picture
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.render.composite import UNCHANGED, Picture, make_picture
+from warpir.render.composite import UNCHANGED
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.mirror import mirror_pixels, shown_mirror
 from warpir.scene.asset import Material
 from warpir.scene.light import Light
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 
 VIEW = camera(24, 16, 24.0, (0.0, 2.0, 0.0), pitch=-30.0)
 CENTRE, RADIUS = np.array([0.0, 1.2, -4.0]), 0.8
@@ -134,22 +135,14 @@ def test_traced_pixels_hold_nearly_all_of_the_image(device: str, roughness: floa
     assert len(traced) < VIEW.width * VIEW.height
 
 
-def picture(device: str, roughness: float | None, is_reinhard: bool, bend: bool) -> Picture:
-    """A picture of `renderer` on a ground of this coat."""
-    knots = (bent(1, 1), bent(3, 2)) if bend else (ToneKnots.identity(1), ToneKnots.identity(3))
-    quality = replace(QUALITY, ground_roughness=roughness)
-    light = sunny()
-    return make_picture(renderer(device), light, light, photo(), quality, *knots, is_reinhard)
-
-
-@pytest.mark.parametrize("is_reinhard", [True, False], ids=["reinhard", "linear"])
-@pytest.mark.parametrize("bend", [False, True], ids=["identity", "curves"])
+@pytest.mark.parametrize("tone", ["reinhard", "linear"])
+@pytest.mark.parametrize("made", [Curves.identity, bent], ids=["identity", "curves"])
 def test_image_is_a_layer_and_changes_nothing_else(
-    device: str, is_reinhard: bool, bend: bool
+    device: str, tone: str, made: Callable[[str], Curves]
 ) -> None:
     """A coat adds a layer, which recomposes; object and shadow keep their bytes."""
-    off = picture(device, None, is_reinhard, bend)
-    on = picture(device, 0.2, is_reinhard, bend)
+    off = picture(device, made(tone))
+    on = picture(device, made(tone), quality=replace(QUALITY, ground_roughness=0.2))
     assert off.layers.mirror is None and on.layers.mirror is not None
     for name in ("foreground", "shadow_ratio", "plate", "matte"):
         np.testing.assert_array_equal(getattr(off.layers, name), getattr(on.layers, name))

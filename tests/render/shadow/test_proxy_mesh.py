@@ -37,7 +37,7 @@ from warpir.render.integrator import MaterialTensors
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ReceiverSamples
 from warpir.render.picture.photo_scene import scene_of
-from warpir.render.picture.planes import Quality
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator
@@ -48,7 +48,7 @@ from warpir.scene.lamps import lamp_axes, without_lamps
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, plain_sky, sun_lobe
 from warpir.scene.placement import place_asset
 from warpir.scene.receiver import ReceiverMesh, first_hit, is_in_view
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 
 LINEAR = Curves.identity("linear")
 
@@ -528,8 +528,7 @@ def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
         light = Light(SUN, plain_sky((0.45, 0.62, 1.0), (0.2, 0.2, 0.2)))
         picture = make_picture(
             Renderer(scene_of(inputs, inputs.camera, device, LINEAR)), light, light, photo,
-            Quality(16, 1, 2, 3), ToneKnots.identity(1), ToneKnots.identity(3), False,
-            shadow_mask=inputs.shadow_mask,
+            Quality(16, 1, 2, 3), LINEAR, shadow_mask=inputs.shadow_mask,
         )  # fmt: skip
         layers = picture.layers
         return layers.shadow_ratio, float(layers.foreground[..., :3].sum())

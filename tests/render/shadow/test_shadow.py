@@ -9,8 +9,9 @@ from tests.builders.shapes import all_pixels, camera, constant, ground, lobe, pl
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Receiver, Scene
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
-from warpir.render.shadow.picture import BEND, ShadowSamples, picture_ratio
+from warpir.render.shadow.picture import BEND, picture_ratio
 from warpir.render.shadow.pilot import run_pilot
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light
@@ -19,7 +20,7 @@ from warpir.scene.receiver import mesh_of
 RADIUS, HEIGHT = 0.5, 1.5
 """Of a ball, and of its centre above the ground [m]."""
 VIEW = camera(128, 80, 126.0, (0.0, 3.0, 6.0), pitch=-25.0)
-SAMPLES = ShadowSamples(16, 1, 5, 0.0)
+QUALITY = Quality(16, 1, 1, 5)
 EXACT_SAMPLES = 512
 
 
@@ -40,13 +41,12 @@ def seen_ground(view: Camera) -> Float64Array:
 
 
 def ratio_everywhere(
-    renderer: Renderer, light: Light, samples: ShadowSamples
+    renderer: Renderer, light: Light, quality: Quality = QUALITY
 ) -> tuple[IntArray, FloatArray]:
     args = light_args(light, renderer.device)
     count = len(all_pixels(renderer.scene.camera))
-    return picture_ratio(
-        renderer, args, np.zeros(count, np.int32), np.ones(count, np.bool_), samples
-    )
+    nothing, everywhere = np.zeros(count, np.int32), np.ones(count, np.bool_)
+    return picture_ratio(renderer, args, nothing, everywhere, quality)
 
 
 def sunny() -> Light:
@@ -95,10 +95,10 @@ def test_sampled_loss_is_that_of_the_ratio_of_two_sums(device: str) -> None:
 
 def test_interpolation_is_nearer_to_the_truth_than_tracing_each_pixel(device: str) -> None:
     renderer, light = ball(device), sunny()
-    pixels, ratio = ratio_everywhere(renderer, light, SAMPLES)
+    pixels, ratio = ratio_everywhere(renderer, light)
     args, nothing = light_args(light, renderer.device), np.zeros(len(pixels), np.int32)
     truth = renderer.ratio(renderer.receiver(args, pixels, nothing, EXACT_SAMPLES, 1, 99))
-    traced = renderer.ratio(renderer.receiver(args, pixels, nothing, SAMPLES.spp, 1, 5))
+    traced = renderer.ratio(renderer.receiver(args, pixels, nothing, QUALITY.samples, 1, 5))
     interpolated = np.abs(ratio - traced).max(axis=1) > 0.0
     assert interpolated.mean() > 0.3
     ours, theirs = (np.sqrt(((r - truth)[interpolated] ** 2).mean()) for r in (ratio, traced))
@@ -109,13 +109,13 @@ def test_interpolation_is_nearer_to_the_truth_than_tracing_each_pixel(device: st
 
 def test_light_that_the_ball_throws_is_interpolated_too(device: str) -> None:
     renderer, light = ball(device, bounce_depth=3), sunny()
-    samples = replace(SAMPLES, spp=64)
-    pixels, ratio = ratio_everywhere(renderer, light, samples)
+    quality = replace(QUALITY, samples=64)
+    pixels, ratio = ratio_everywhere(renderer, light, quality)
     args, nothing = light_args(light, renderer.device), np.zeros(len(pixels), np.int32)
     sums = renderer.receiver(args, pixels, nothing, EXACT_SAMPLES, 1, 99)
     gain = sums.thrown / sums.unoccluded
     bare = ball(device)
-    there, without = ratio_everywhere(bare, light, samples)
+    there, without = ratio_everywhere(bare, light, quality)
     shown = np.ones((VIEW.width * VIEW.height, 3), np.float32)
     shown[there] = without
     found = ratio - shown[pixels]
@@ -129,8 +129,8 @@ def test_only_wanted_pixels_are_returned_and_others_do_not_change_them(device: s
     args = light_args(light, renderer.device)
     count = VIEW.width * VIEW.height
     wanted = np.arange(count) % 3 == 0
-    whole, ratio = ratio_everywhere(renderer, light, SAMPLES)
-    some, of_some = picture_ratio(renderer, args, np.zeros(count, np.int32), wanted, SAMPLES)
+    whole, ratio = ratio_everywhere(renderer, light)
+    some, of_some = picture_ratio(renderer, args, np.zeros(count, np.int32), wanted, QUALITY)
     np.testing.assert_array_equal(some, whole[wanted[whole]])
     np.testing.assert_array_equal(of_some, ratio[wanted[whole]])
 
@@ -139,14 +139,14 @@ def test_a_mesh_of_the_receiver_is_traced_by_the_pixel(device: str) -> None:
     wall = mesh_of(placed(quad((0.0, 1.0, -2.0), (3.0, 0.0, 0.0), (0.0, 1.0, 0.0))).asset)
     plane = replace(ground(0.0), mesh=wall)
     renderer, light = ball(device, receiver=plane), sunny()
-    pixels, ratio = ratio_everywhere(renderer, light, SAMPLES)
+    pixels, ratio = ratio_everywhere(renderer, light)
     args, nothing = light_args(light, renderer.device), np.zeros(len(pixels), np.int32)
-    traced = renderer.receiver(args, pixels, nothing, SAMPLES.spp, 1, SAMPLES.seed)
+    traced = renderer.receiver(args, pixels, nothing, QUALITY.samples, 1, QUALITY.seed)
     np.testing.assert_array_equal(ratio, renderer.ratio(traced))
 
 
 def test_no_light_is_a_ratio_of_one(device: str) -> None:
-    pixels, ratio = ratio_everywhere(ball(device), constant((0.0, 0.0, 0.0)), SAMPLES)
+    pixels, ratio = ratio_everywhere(ball(device), constant((0.0, 0.0, 0.0)))
     assert len(pixels) == 0 and ratio.shape == (0, 3)
 
 

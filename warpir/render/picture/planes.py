@@ -12,34 +12,16 @@ from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
 from warpir.render.allocation import as_shown
 from warpir.render.device_light import light_args
+from warpir.render.picture.quality import Quality
 from warpir.render.picture.tone import tone_mapped
 from warpir.render.renderer import Foreground, GBuffer, Renderer
 from warpir.render.shadow.mirror import mirror_planes
-from warpir.render.shadow.picture import ShadowSamples, picture_ratio
+from warpir.render.shadow.picture import picture_ratio
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light
 from warpir.scene.shadow_mask import ShadowMask
-from warpir.scene.tone_curves import Curves, ToneKnots
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Sampling of a rendering."""
-
-    samples: int
-    """Camera samples per pixel."""
-    rays: int
-    """Rays per camera sample and sampling technique."""
-    depth: int
-    """Largest number of surface interactions of a path."""
-    seed: int
-    indirect_limit: float = 0.0
-    """Clamp on a path's indirect radiance; 0 for none, which is unbiased."""
-    is_denoised: bool = False
-    """Whether the noise of object and shadow is taken out (`warpir.look.denoise`)."""
-    ground_roughness: float | None = None
-    """Of the coat in which the ground shows the object [1]; None: the ground is matt."""
+from warpir.scene.tone_curves import Curves
 
 
 @dataclass(frozen=True)
@@ -60,9 +42,7 @@ def render(
     light_fg: Light,
     light_shadow: Light,
     quality: Quality,
-    curve_fg: ToneKnots,
-    curve_shadow: ToneKnots,
-    is_reinhard: bool = True,
+    curves: Curves,
     *,
     shadow_mask: ShadowMask | None = None,
     behind: Light | None = None,
@@ -74,9 +54,7 @@ def render(
         light_fg: Lights the object.
         light_shadow: Casts its shadow; often the same object as ``light_fg``.
         quality: Samples, rays, depth, seed.
-        curve_fg: One tone curve.
-        curve_shadow: Three tone curves.
-        is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+        curves: Tone curves and operator.
         shadow_mask: Mask of the ground that is in shadow already.
         behind: What a glossy ground showed before the object came; None: ``light_fg``.
     """
@@ -108,12 +86,12 @@ def render(
         camera = renderer.scene.camera
         foreground = _denoised(foreground, gbuffer, camera)
         ratio = denoised_ratio(ratio, receiver_pixels, (camera.height, camera.width))
-    fg, beta = tone_mapped(renderer, foreground, ratio, curve_fg, curve_shadow, is_reinhard)
+    fg, beta = tone_mapped(renderer, foreground, ratio, curves)
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if quality.ground_roughness is not None:
-        planes |= _mirror(renderer, args_fg, behind, gbuffer.object_pixels, planes, quality)
+        hidden = None if behind is None else light_args(behind, renderer.device)
+        planes |= mirror_planes(renderer, args_fg, gbuffer.object_pixels, planes, quality, hidden)
     counts = len(gbuffer.object_pixels), len(receiver_pixels)
-    curves = Curves("reinhard" if is_reinhard else "linear", curve_fg, curve_shadow)
     return Rendering(planes, *counts, curves)
 
 
@@ -148,14 +126,13 @@ def _shadow(
     Where the photo's ground is in shadow already, the lamps do not count.
     """
     camera = renderer.scene.camera
-    samples = _samples(quality)
     coverage = spread((camera.height, camera.width), object_pixels, mask).reshape(-1)
     may_see_object = spread((camera.height, camera.width), object_pixels, np.ones_like(mask))
     sees = may_see_object.reshape(-1).astype(np.int32)
 
     def shaded(args: LightArgs, wanted: BoolArray) -> tuple[IntArray, FloatArray]:
         # The samples of a pixel that the object fills, as its radiance has seen, see no ground.
-        return picture_ratio(renderer, args, sees, wanted & (coverage < 1.0), samples)
+        return picture_ratio(renderer, args, sees, wanted & (coverage < 1.0), quality)
 
     if shadow_mask is None:
         return shaded(args, np.ones(len(sees), bool))
@@ -187,34 +164,6 @@ def _mixed(
     whole, without, share = whole[pixels], without[pixels], shares[pixels, None]
     # Exact where both agree, and at both ends.
     return pixels, np.where(share < 1.0, whole + share * (without - whole), without)
-
-
-def _mirror(
-    renderer: Renderer,
-    args: LightArgs,
-    behind: Light | None,
-    object_pixels: IntArray,
-    planes: dict[str, FloatArray],
-    quality: Quality,
-) -> dict[str, FloatArray]:
-    """Return the planes of the object's mirror image in the ground; ``args`` light the object."""
-    assert quality.ground_roughness is not None
-    hidden = None if behind is None else light_args(behind, renderer.device)
-    return mirror_planes(
-        renderer,
-        args,
-        object_pixels,
-        planes["matte"],
-        (planes["shadow_ratio"] != 1.0).any(axis=-1),
-        quality.ground_roughness,
-        quality.depth,
-        _samples(quality),
-        hidden,
-    )
-
-
-def _samples(quality: Quality) -> ShadowSamples:
-    return ShadowSamples(quality.samples, quality.rays, quality.seed, quality.indirect_limit)
 
 
 def _planes(

@@ -8,16 +8,14 @@ from warpir.core.arrays import FloatArray
 from warpir.kernels.composite import tone_foreground, tone_shadow
 from warpir.render.device import Rows
 from warpir.render.renderer import Foreground, Renderer
-from warpir.scene.tone_curves import ToneKnots
+from warpir.scene.tone_curves import Curves
 
 
 def tone_mapped(
     renderer: Renderer,
     foreground: Foreground,
     ratio: FloatArray,
-    curve_fg: ToneKnots,
-    curve_shadow: ToneKnots,
-    is_reinhard: bool,
+    curves: Curves,
 ) -> tuple[FloatArray, FloatArray]:
     """Map object radiance and shadow ratio to display-linear values.
 
@@ -25,9 +23,7 @@ def tone_mapped(
         renderer: Launches the kernels.
         foreground: Radiance of the object, premultiplied.
         ratio: Shadow ratio, shape [receiver_pixel, 3].
-        curve_fg: One tone curve.
-        curve_shadow: Three tone curves.
-        is_reinhard: Whether Reinhard's operator precedes the foreground curve.
+        curves: Tone curves and operator.
 
     Returns:
         The object, not premultiplied [1], shape [object_pixel, 3], and what the plate is multiplied
@@ -42,9 +38,9 @@ def tone_mapped(
         [
             Rows(renderer.upload(foreground.radiance, wp.vec3)),
             Rows(renderer.upload(foreground.mask, wp.float32)),
-            int(is_reinhard),
-            *(renderer.upload(k, wp.float32) for k in curve_fg.arrays()),
-            curve_fg.bin_count,
+            int(curves.tone == "reinhard"),
+            *(renderer.upload(k, wp.float32) for k in curves.foreground.arrays()),
+            curves.foreground.bin_count,
             Rows(fg),
         ],
         1,
@@ -54,8 +50,8 @@ def tone_mapped(
         receivers,
         [
             Rows(renderer.upload(ratio, wp.vec3)),
-            *(renderer.upload(k, wp.float32) for k in curve_shadow.arrays()),
-            curve_shadow.bin_count,
+            *(renderer.upload(k, wp.float32) for k in curves.shadow_ratio.arrays()),
+            curves.shadow_ratio.bin_count,
             Rows(shadow),
         ],
         1,

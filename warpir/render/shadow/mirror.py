@@ -13,8 +13,8 @@ import numpy as np
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.kernels.types import LightArgs
 from warpir.look.camera_look import CameraLook
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
-from warpir.render.shadow.picture import ShadowSamples
 from warpir.render.shadow.pilot import dilate
 from warpir.scene.placement import box_corners
 from warpir.scene.tone_curves import Curves
@@ -81,11 +81,8 @@ def mirror_planes(
     renderer: Renderer,
     light: LightArgs,
     object_pixels: IntArray,
-    matte: FloatArray,
-    shaded: BoolArray,
-    roughness: float,
-    depth: int,
-    samples: ShadowSamples,
+    planes: dict[str, FloatArray],
+    quality: Quality,
     behind: LightArgs | None = None,
 ) -> dict[str, FloatArray]:
     """Return the radiance of the image, ``image``, what it hides, ``hidden``, and not, ``kept``.
@@ -96,15 +93,14 @@ def mirror_planes(
         renderer: The scene; its receiver is a plane.
         light: Light on the object.
         object_pixels: Where the object may hide the plane, row-major.
-        matte: Coverage of each pixel [1], shape [H, W].
-        shaded: Where the ground is darker or lighter by the object, shape [H, W].
-        roughness: Perceptual roughness of the coat [1].
-        depth: Largest number of interactions with the object.
-        samples: Counts and seed.
+        planes: ``matte``, shape [H, W], and ``shadow_ratio``, shape [H, W, 3].
+        quality: Counts, seed, and the roughness of the coat.
         behind: What the coat showed before; None: the light.
     """
-    wanted = shaded & (matte < 1.0)
-    wanted.reshape(-1)[mirror_pixels(renderer, matte < 1.0, roughness)] = True
+    assert quality.ground_roughness is not None
+    matte = planes["matte"]
+    wanted = (planes["shadow_ratio"] != 1.0).any(axis=-1) & (matte < 1.0)
+    wanted.reshape(-1)[mirror_pixels(renderer, matte < 1.0, quality.ground_roughness)] = True
     pixels = np.flatnonzero(wanted).astype(np.int32)
     may_see_object = np.zeros(matte.size, np.int32)
     may_see_object[object_pixels] = 1
@@ -112,17 +108,17 @@ def mirror_planes(
         light,
         pixels,
         may_see_object[pixels],
-        roughness,
-        samples.spp,
-        samples.rays,
-        depth,
-        samples.seed,
-        samples.indirect_limit,
+        quality.ground_roughness,
+        quality.samples,
+        quality.rays,
+        quality.depth,
+        quality.seed,
+        quality.indirect_limit,
         behind,
     )
-    planes = np.zeros((3, matte.size, 3), np.float32)
-    planes[:, pixels] = traced
-    image, hidden, kept = planes.reshape(3, *matte.shape, 3)
+    found = np.zeros((3, matte.size, 3), np.float32)
+    found[:, pixels] = traced
+    image, hidden, kept = found.reshape(3, *matte.shape, 3)
     return {"image": image, "hidden": hidden, "kept": kept}
 
 

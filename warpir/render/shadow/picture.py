@@ -12,7 +12,6 @@ noise included, the ratio comes from `Renderer.receiver`; so does all of it near
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
 from warpir.render.allocation import as_shown
+from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import BLOCK, Pilot, dilate, neighbourhood, run_pilot
 
@@ -29,25 +29,12 @@ LOSS_SAMPLES, GAIN_SAMPLES = 2, 4
 """Samples of a block over those of a pixel, for what the object takes and for what it throws."""
 
 
-@dataclass(frozen=True)
-class ShadowSamples:
-    """Sampling of the shadow ratio."""
-
-    spp: int
-    """Camera samples per pixel."""
-    rays: int
-    """Directions per technique and camera sample."""
-    seed: int
-    indirect_limit: float
-    """As `Renderer.receiver` has it."""
-
-
 def picture_ratio(
     renderer: Renderer,
     light: LightArgs,
     may_see_object: IntArray,
     wanted: BoolArray,
-    samples: ShadowSamples,
+    quality: Quality,
 ) -> tuple[IntArray, FloatArray]:
     """Return the pixels whose light the object may change, and their shadow ratio per channel.
 
@@ -56,13 +43,13 @@ def picture_ratio(
         light: From `light_args`.
         may_see_object: 1 where the object may hide the receiver, row-major, shape [H * W].
         wanted: Pixels to return at most, shape [H * W].
-        samples: Counts and seed.
+        quality: Counts and seed.
 
     Returns:
         Row-major pixels, shape [receiver_pixel], and ratios, shape [receiver_pixel, 3].
     """
     camera = renderer.scene.camera
-    pilot = run_pilot(renderer, light, samples.seed, samples.indirect_limit)
+    pilot = run_pilot(renderer, light, quality.seed, quality.indirect_limit)
     pixels = np.flatnonzero(wanted & pilot.pixels_of(pilot.changes, camera)).astype(np.int32)
     gains = pilot.pixels_of(pilot.gains, camera)[pixels]
     ratio = np.ones((len(pixels), 3), np.float32)
@@ -71,7 +58,7 @@ def picture_ratio(
     # The light of a lamp near the ground falls off from block to block.
     is_even = renderer.scene.receiver.mesh is None and not renderer.scene.lamps
     if is_even and pilot.open_radiance.min() > 0.0:
-        blocks = _Blocks(renderer, light, pilot, samples)
+        blocks = _Blocks(renderer, light, pilot, quality)
         bends, gain_bends = (
             pilot.pixels_of(b, camera)[pixels] for b in (blocks.bends, blocks.gain_bends)
         )
@@ -85,10 +72,10 @@ def picture_ratio(
         light,
         pixels[whole],
         may_see_object[pixels[whole]],
-        samples.spp,
-        samples.rays,
-        samples.seed,
-        indirect_limit=samples.indirect_limit,
+        quality.samples,
+        quality.rays,
+        quality.seed,
+        indirect_limit=quality.indirect_limit,
         may_gain=gain_bends[whole],
         judged=as_shown,
     )
@@ -107,11 +94,11 @@ class _Blocks:
     """
 
     def __init__(
-        self, renderer: Renderer, light: LightArgs, pilot: Pilot, samples: ShadowSamples
+        self, renderer: Renderer, light: LightArgs, pilot: Pilot, quality: Quality
     ) -> None:
-        spp, rays = samples.spp, samples.rays
+        spp, rays = quality.samples, quality.rays
         # The pilot's samples decided which blocks are here: others than those say how much.
-        seed = samples.seed + 1
+        seed = quality.seed + 1
 
         def of_blocks(
             blocks: BoolArray, share_of: Callable[[IntArray], FloatArray]
@@ -136,7 +123,7 @@ class _Blocks:
             return 1.0 - renderer.ratio(seen)
 
         def added(index: IntArray) -> FloatArray:
-            limit = samples.indirect_limit
+            limit = quality.indirect_limit
             thrown = renderer.thrown(
                 light, index, GAIN_SAMPLES * spp, rays, seed, pilot.view, limit
             )
