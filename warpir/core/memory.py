@@ -359,8 +359,6 @@ def _available(proc: Path) -> int:
 
 
 def _left_to_map(proc: Path) -> int:
-    import resource
-
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY:
         return sys.maxsize

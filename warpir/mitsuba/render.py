@@ -263,20 +263,17 @@ def _emitter(lamp: Lamp, center: Float64Array, radius: float) -> dict[str, objec
     kind = "sphere"
     if isinstance(lamp, RectangleLamp):
         kind = "rectangle"
-        to_world[:3, 0], to_world[:3, 1] = (
-            lamp.edge_x / (2.0 * radius),
-            lamp.edge_y / (2.0 * radius),
-        )
+        to_world[:3, 0] = lamp.edge_x / (2.0 * radius)
+        to_world[:3, 1] = lamp.edge_y / (2.0 * radius)
         normal = np.cross(lamp.edge_x, lamp.edge_y)
         to_world[:3, 2] = normal / np.linalg.norm(normal)
     else:
         to_world[:3, :3] *= lamp.radius / radius
-    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
     return {
         "type": kind,
         "to_world": mi.ScalarTransform4f(to_world),
         "emitter": {"type": "area", "radiance": color},
-        "bsdf": black,
+        "bsdf": _matt(0.0),
     }
 
 
