@@ -14,6 +14,7 @@ from warpir.core.color import luminance
 from warpir.core.latlong import texel_solid_angles
 from warpir.kernels.transport.foreground import (
     SurfacePoints,
+    spread_record,
     trace_direct,
     trace_paths,
     trace_points,
@@ -25,7 +26,7 @@ from warpir.kernels.transport.receiver import (
     trace_receiver_points,
 )
 from warpir.kernels.transport.texels import TexelArgs
-from warpir.kernels.types import Layers, LightArgs
+from warpir.kernels.types import Layers, LightArgs, LightRecord
 from warpir.render.device import Rows
 from warpir.render.device_light import FINE_FROM, drawn, light_args
 from warpir.render.renderer import Renderer
@@ -170,6 +171,25 @@ def proposal_of(expected: FloatArray) -> Light:
     mean = float((flux * texel_solid_angles(height, 2 * height)[:, None]).sum()) / (4.0 * np.pi)
     flat = 0.5 + 0.5 * flux / mean if mean > 0.0 else np.ones_like(flux)
     return Light(texels=np.repeat(flat[..., None], 3, axis=2).astype(np.float32))
+
+
+def recorded_light(renderer: Renderer, expected: FloatArray, seed: int) -> LightArgs:
+    """Return black light whose directions are those of later vertices, for paths that record them.
+
+    What such paths still see does not depend on the light.
+    """
+    light = light_args(proposal_of(expected), renderer.device)
+    light.texels = wp.zeros(expected.shape[:2], dtype=wp.vec3, device=renderer.device)
+    return drawn(renderer, light, seed, FINE_FROM)
+
+
+def spread_rows(renderer: Renderer, record: LightRecord, height: int) -> wp.array:
+    """Return the rows of a map that recorded directions are, vec3, shape [row, texel]."""
+    count, capacity = record.wi.shape
+    T = wp.zeros((count, 2 * height * height), dtype=wp.vec3, device=renderer.device)
+    rows = [Rows(record), height, 2 * height, Rows(T)]
+    renderer.launch(spread_record, count, rows, capacity, "transport")
+    return T
 
 
 def _groups(
@@ -334,7 +354,11 @@ def plane_rows(
 
 
 def chunks(
-    renderer: Renderer, trace: Callable[[int, int], Traced], count: int, size: int
+    renderer: Renderer,
+    trace: Callable[[int, int], Traced],
+    count: int,
+    size: int,
+    lower: str = LOWER_SHADOW,
 ) -> Iterator[Traced]:
     """Yield ``trace`` of each ``size`` pixels, in halves where memory is short."""
     for start in range(0, count, size):
@@ -343,7 +367,7 @@ def chunks(
             return trace(start + first, start + last)
 
         length = min(size, count - start)
-        yield from renderer.memory.in_chunks(part, length, TRACING, LOWER_SHADOW)
+        yield from renderer.memory.in_chunks(part, length, TRACING, lower)
 
 
 @dataclass(frozen=True)

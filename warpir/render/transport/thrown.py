@@ -12,9 +12,6 @@ from collections.abc import Iterator
 import warp as wp
 
 from warpir.core.arrays import FloatArray, IntArray
-from warpir.kernels.transport.foreground import spread_record
-from warpir.render.device import Rows
-from warpir.render.device_light import FINE_FROM, drawn, light_args
 from warpir.render.launches import ObjectLaunch
 from warpir.render.mis.samples import new_light_record
 from warpir.render.renderer import Renderer
@@ -22,7 +19,8 @@ from warpir.render.transport.rows import (
     CHUNK_BYTES,
     TransportSettings,
     chunks,
-    proposal_of,
+    recorded_light,
+    spread_rows,
 )
 
 
@@ -48,28 +46,21 @@ def thrown_rows(
         Radiance of the white receiver per texel radiance [1], vec3, shape [row, texel], and that
         which does not depend on the light, shape [row, 3].
     """
-    scene, device, depth = renderer.scene, renderer.device, renderer.bounce_depth
-    height, width = expected.shape[:2]
-    light = light_args(proposal_of(expected), device)
-    # Directions alone are asked for; what is left is what the object emits.
-    light.texels = wp.zeros((height, width), dtype=wp.vec3, device=device)
-    light = drawn(renderer, light, seed, FINE_FROM)
+    scene, depth, height = renderer.scene, renderer.bounce_depth, len(expected)
+    light = recorded_light(renderer, expected, seed)
     spp = min(settings.subsamples, settings.paths)
     rays = settings.paths // spp
     launch = ObjectLaunch(
         light, scene.shadow_material_args, scene.camera_args, rays, depth, 0.0, seed
     )
     capacity = 2 * spp * rays * depth
-    size = max(1, CHUNK_BYTES // (24 * capacity + 12 * height * width))
+    size = max(1, CHUNK_BYTES // (24 * capacity + 24 * height * height))
 
     def trace(start: int, stop: int) -> tuple[wp.array, FloatArray]:
-        record = new_light_record(stop - start, capacity, device)
+        record = new_light_record(stop - start, capacity, renderer.device)
         emitted = launch.thrown(
             renderer, pixels[start:stop], may_see_object[start:stop], spp, record
         )
-        T = wp.zeros((stop - start, height * width), dtype=wp.vec3, device=device)
-        rows = [Rows(record), height, width, Rows(T)]
-        renderer.launch(spread_record, stop - start, rows, capacity, "transport")
-        return T, emitted
+        return spread_rows(renderer, record, height), emitted
 
     yield from chunks(renderer, trace, len(pixels), size)
