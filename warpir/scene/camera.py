@@ -310,25 +310,6 @@ def camera_pose(pitch_deg: float, roll_deg: float, camera_height: float) -> Floa
     return pose
 
 
-def focal_from_fov(width: int, fov_deg: float) -> float:
-    """Return the focal length of a horizontal field of view [px].
-
-    Args:
-        width: Image width [px].
-        fov_deg: Horizontal field of view [deg].
-
-    Raises:
-        InputError: Out of range (`ExitCode.USAGE`).
-    """
-    if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
-        raise InputError(
-            "--fov",
-            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
-            code=ExitCode.USAGE,
-        )
-    return float(width / 2.0 / np.tan(np.radians(fov_deg) / 2.0))
-
-
 def camera_from_fov(
     width: int,
     height: int,
@@ -348,10 +329,16 @@ def camera_from_fov(
         horizon: Where the horizon is: a share of the height when within (0, 1), else a row [px].
 
     Raises:
-        InputError: A number outside its range; the text names the flag.
+        InputError: No field of view (`ExitCode.USAGE`).
     """
     notices = []
-    focal = focal_from_fov(width, fov_deg)
+    if not (np.isfinite(fov_deg) and 0.0 < fov_deg < 180.0):
+        raise InputError(
+            "--fov",
+            f"not a field of view (found {fov_deg}; expected degrees between 0 and 180)",
+            code=ExitCode.USAGE,
+        )
+    focal = float(width / 2.0 / np.tan(np.radians(fov_deg) / 2.0))
     if fov_deg < 3.2:
         notices.append(f"--fov: {fov_deg} degrees is very narrow; was it meant in radians?")
     return _level_camera(width, height, focal, pitch_deg, camera_height, horizon, notices)
@@ -366,12 +353,6 @@ def camera_from_exif(
     horizon: float | None = None,
 ) -> Camera:
     """Return an upright camera from EXIF's 35 mm equivalent focal length [mm], by the diagonal."""
-    if not (np.isfinite(focal_35mm) and focal_35mm > 0.0):
-        raise InputError(
-            "--photo",
-            f"EXIF focal length is not one (found {focal_35mm}; expected millimetres > 0)",
-            "give --fov",
-        )
     fx = focal_35mm * float(np.hypot(width, height)) / FILM_DIAGONAL_35MM
     fov_deg = 2.0 * float(np.degrees(np.arctan(width / 2.0 / fx)))
     assumed = [
@@ -387,12 +368,7 @@ def horizon_row(horizon: float, height: int) -> float:
     Args:
         horizon: A share of the height when within (0, 1), else a row [px].
         height: Image height [px].
-
-    Raises:
-        InputError: Not finite (`ExitCode.USAGE`).
     """
-    if not np.isfinite(horizon):
-        raise InputError("--horizon", f"not a row (found {horizon})", code=ExitCode.USAGE)
     return horizon * height if 0.0 < horizon < 1.0 else horizon
 
 
@@ -407,27 +383,11 @@ def _level_camera(
     assumed: Sequence[str] = (),
 ) -> Camera:
     """Return a camera without roll whose principal point is the image centre."""
-    if width < 1 or height < 1:
-        raise InputError("--photo", f"no pixels (found {width} x {height})")
-    if not (np.isfinite(camera_height) and camera_height > 0.0):
-        raise InputError(
-            "--camera-height",
-            f"not above the ground (found {camera_height}; expected metres > 0)",
-            code=ExitCode.USAGE,
-        )
     cx, cy = width / 2.0, height / 2.0
-    if horizon is None:
-        if not (np.isfinite(pitch_deg) and -90.0 <= pitch_deg <= 90.0):
-            raise InputError(
-                "--pitch",
-                f"not a tilt (found {pitch_deg}; expected degrees between -90 and 90)",
-                code=ExitCode.USAGE,
-            )
-        pitch = float(np.radians(pitch_deg))
-    else:
-        row = horizon_row(horizon, height)
+    pitch = float(np.radians(pitch_deg))
+    if horizon is not None:
         # A level direction straight ahead projects to row cy + f tan(pitch).
-        pitch = float(np.arctan2(row - cy, focal))
+        pitch = float(np.arctan2(horizon_row(horizon, height) - cy, focal))
     cos, sin = np.cos(pitch), np.sin(pitch)
     c2w = np.array(
         [

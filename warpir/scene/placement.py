@@ -261,10 +261,7 @@ def point_on_ground(at: tuple[float, float], camera: Camera, plane: Float64Array
         InputError: The pixel is outside the photo, or at or above the horizon.
     """
     _check_in_photo(at, camera)
-    try:
-        return ground_point(camera, *at, plane=tuple(map(float, plane)))
-    except InputError as error:
-        raise InputError("--at", error.what, error.advice, error.code) from None
+    return ground_point(camera, *at, plane=tuple(map(float, plane)))
 
 
 def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
