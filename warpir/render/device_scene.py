@@ -17,12 +17,7 @@ from numpy.typing import NDArray
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.kernels.receiver_mesh import trace_seen
-from warpir.kernels.types import (
-    CameraArgs,
-    GlassArgs,
-    MaterialArgs,
-    ReceiverArgs,
-)
+from warpir.kernels.types import CameraArgs, GlassArgs, MaterialArgs, ReceiverArgs
 from warpir.render.device_light import lamp_args
 from warpir.render.glass.solid import absorption, glass_args, mean_way, straight_shares
 from warpir.render.rays.embree import EmbreeScene, library
@@ -159,20 +154,18 @@ class Scene:
         args.indices = self._array(np.zeros(3, np.int32), wp.int32)
         args.radiance = self._array(np.zeros((1, 1, 3), np.float32), wp.vec3)
         mesh = receiver.mesh
-        if mesh is None:
-            # The ground behind glass is what the photo shows there.
-            if self.has_solid_glass and receiver.radiance is not None:
-                args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
-                self._upload_radiance(args, receiver.radiance)
+        if mesh is not None:
+            positions = mesh.positions - self.origin
+            args.positions = self._array(positions.astype(np.float32), wp.vec3)
+            args.indices = self._array(mesh.indices.reshape(-1), wp.int32)
+            self.receiver_mesh = wp.Mesh(
+                points=args.positions, indices=args.indices, bvh_constructor="sah"
+            )
+            args.mesh = self.receiver_mesh.id
+            args.epsilon = RECEIVER_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
+        # Without a mesh, the ground behind glass is what the photo shows there.
+        elif not self.has_solid_glass or receiver.radiance is None:
             return args
-        positions = mesh.positions - self.origin
-        args.positions = self._array(positions.astype(np.float32), wp.vec3)
-        args.indices = self._array(mesh.indices.reshape(-1), wp.int32)
-        self.receiver_mesh = wp.Mesh(
-            points=args.positions, indices=args.indices, bvh_constructor="sah"
-        )
-        args.mesh = self.receiver_mesh.id
-        args.epsilon = RECEIVER_EPSILON * float(np.linalg.norm(np.ptp(positions, axis=0)))
         args.eye = wp.vec3(*(camera.c2w[:3, 3] - self.origin).astype(np.float32))
         if receiver.radiance is not None:
             self._upload_radiance(args, receiver.radiance)
