@@ -40,7 +40,7 @@ class Integrator(Protocol):
         light_fg: Tensor,
         light_shadow: Tensor,
         seed: int,
-        materials: MaterialTensors | None = None,
+        *,
         lamp_powers: Tensor | None = None,
     ) -> Radiance:
         """Render the object under ``light_fg`` and the plane under ``light_shadow``.

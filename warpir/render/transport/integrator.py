@@ -28,7 +28,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import row_edges
 from warpir.core.memory import Need
 from warpir.render.glass.rows import glass_rows
-from warpir.render.integrator import MaterialTensors, Radiance
+from warpir.render.integrator import Radiance
 from warpir.render.near.rows import LampRows, lamp_rows, with_lamps
 from warpir.render.renderer import Renderer, index_of
 from warpir.render.transport.cache import content_key, load_rows, save_rows
@@ -197,11 +197,7 @@ class TransportIntegrator:
 
     def _trace_object(self, seed: int) -> dict[str, Tensor]:
         settings, count = self.settings, len(self.object_pixels)
-        dtype = DTYPES[settings.dtype]
-        shape = (3, count, 2 * settings.height_fg**2)
-        T_fg = self.renderer.memory.again(
-            lambda: torch.empty(shape, dtype=dtype, device=self.device), TRACING, LOWER_OBJECT
-        )
+        T_fg = self._new_rows((3, count, 2 * settings.height_fg**2), LOWER_OBJECT)
         emission = torch.empty((count, 3), device=self.device)
         mask = torch.empty(count, device=self.device)
         trace = glass_rows if self.renderer.scene.has_solid_glass else object_rows
@@ -211,10 +207,17 @@ class TransportIntegrator:
             rows = torch.from_numpy(part.rows.astype(np.int64)).to(self.device)
             T, emitted = wp.to_torch(part.T), wp.to_torch(part.emission)
             self._blacken(self.object_pixels[part.rows], "object's transport", T, emitted)
-            T_fg[:, rows] = T.permute(2, 0, 1).to(dtype)
+            T_fg[:, rows] = T.permute(2, 0, 1).to(T_fg.dtype)
             emission[rows] = emitted
             mask[rows] = wp.to_torch(part.count).to(torch.float32) / part.subsamples
         return {"T_fg": T_fg, "emission": emission, "mask": mask}
+
+    def _new_rows(self, shape: tuple[int, int, int], lower: str) -> Tensor:
+        """Return space for the rows of a matrix a channel, shape [channel, row, column]."""
+        dtype = DTYPES[self.settings.dtype]
+        return self.renderer.memory.again(
+            lambda: torch.empty(shape, dtype=dtype, device=self.device), TRACING, lower
+        )
 
     def _blacken(self, pixels: IntArray, stage: str, *rows: Tensor) -> None:
         """Set the rows of pixels that are not finite to 0, in place, and count them.
@@ -260,12 +263,7 @@ class TransportIntegrator:
         """Store each pixel's received light, and the nonzero entries of the blocked light."""
         settings, count = self.settings, len(self.receiver_pixels)
         entries = _Entries(self.device)
-        shape = (1, count, 2 * settings.height_shadow**2)
-        T = self.renderer.memory.again(
-            lambda: torch.empty(shape, dtype=DTYPES[settings.dtype], device=self.device),
-            TRACING,
-            LOWER_SHADOW,
-        )
+        T = self._new_rows((1, count, 2 * settings.height_shadow**2), LOWER_SHADOW)
         bounced = torch.empty((2, count, 3), device=self.device)
         for part in mesh_rows(
             self.renderer,
@@ -291,12 +289,7 @@ class TransportIntegrator:
     def _trace_thrown(self, seed: int) -> dict[str, Tensor]:
         """Store what the object throws onto the receiver, of the map that lights the object."""
         settings, count = self.settings, len(self.receiver_pixels)
-        shape = (3, count, len(self.above_object))
-        T = self.renderer.memory.again(
-            lambda: torch.empty(shape, dtype=DTYPES[settings.dtype], device=self.device),
-            TRACING,
-            LOWER_SHADOW,
-        )
+        T = self._new_rows((3, count, len(self.above_object)), LOWER_SHADOW)
         emission = torch.empty((count, 3), device=self.device)
         start = 0
         for part, emitted in thrown_rows(
@@ -334,18 +327,13 @@ class TransportIntegrator:
         light_fg: Tensor,
         light_shadow: Tensor,
         seed: int,
-        materials: MaterialTensors | None = None,
+        *,
         lamp_powers: Tensor | None = None,
     ) -> Radiance:
         """Render the object under ``light_fg`` and the plane under ``light_shadow``, and the lamps.
 
-        ``seed`` is unused: the stored rows are fixed.
-
-        Raises:
-            ValueError: Materials are given: the stored rows hold the scene's own.
+        ``seed`` is unused: the stored rows are fixed, and hold the scene's own materials.
         """
-        if materials is not None and any(v is not None for v in vars(materials).values()):
-            raise ValueError("transport is frozen for the scene's materials: use mis")
         settings = self.settings
         texels = self._texels(light_fg, settings.height_fg)
         foreground = product(self.T_fg, texels) + self.emission
