@@ -271,14 +271,10 @@ def as_map(light: Light, height: int) -> FloatArray:
 
 def as_file_map(light: Light) -> FloatArray:
     """Return the light as a map for files: a given map's own size, lobes on 512 rows or more."""
-    height = 256
-    if light.texels is not None:
-        height = max(light.texels.shape[0], 16)
-    if light.lobes is not None:
-        height = max(height, 512)
     if light.texels is not None and light.lobes is None:
         return light.texels
-    return as_map(light, height)
+    rows = 0 if light.texels is None else light.texels.shape[0]
+    return as_map(light, max(rows, 512))
 
 
 def summarize(light: Light) -> LightSummary:
@@ -333,6 +329,6 @@ def describe(summary: LightSummary, c2w: Float64Array) -> str:
         *("behind", "behind on the left", "the left", "ahead on the left"),
     )
     side = sides[round(around / 45.0) % 8]
-    height = "overhead" if summary.elevation_deg > 75.0 else f"{summary.elevation_deg:.0f} deg high"
-    where = height if height == "overhead" else f"from {side}, {height}"
+    is_overhead = summary.elevation_deg > 75.0
+    where = "overhead" if is_overhead else f"from {side}, {summary.elevation_deg:.0f} deg high"
     return f"light {where}, {100.0 * summary.peak_share:.0f} % of it from there"
