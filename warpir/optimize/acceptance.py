@@ -65,30 +65,23 @@ class Verdict:
 
 
 @torch.no_grad()
-def judge(
-    force: Force,
-    image: Callable[[float], Tensor],
-    pieces: int = PIECES,
-    draws: int = DRAWS,
-) -> Verdict:
+def judge(force: Force, image: Callable[[float], Tensor], pieces: int = PIECES) -> Verdict:
     """Return whether the potential clearly falls along a path.
 
     Args:
         force: Evaluated in the middle of each piece.
         image: Image at a share of the path, 0 to 1, without noise of its own.
         pieces: Number of pieces of the path.
-        draws: Number of draws, at least 2.
     """
-    seeds = range(draws)
-    total = np.zeros(draws)
+    total = np.zeros(DRAWS)
     before = image(0.0)
     for k in range(pieces):
         after = image((k + 1) / pieces)
-        total += force.work(before, image((k + 0.5) / pieces), after, seeds)
+        total += force.work(before, image((k + 0.5) / pieces), after, range(DRAWS))
         before = after
-    rise, error = float(total.mean()), float(total.std(ddof=1)) / math.sqrt(draws)
+    rise, error = float(total.mean()), float(total.std(ddof=1)) / math.sqrt(DRAWS)
     # Not finite: nothing was shown.
-    return Verdict(bool(rise + ONE_SIDED * error < 0.0), rise, error, draws)
+    return Verdict(bool(rise + ONE_SIDED * error < 0.0), rise, error, DRAWS)
 
 
 def blend(start: dict[str, Tensor], end: dict[str, Tensor], share: float) -> dict[str, Tensor]:

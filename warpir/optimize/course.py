@@ -25,10 +25,9 @@ from warpir.io.images.resize import resize
 from warpir.io.unfinished import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
 from warpir.optimize.checkpoint import is_due
-from warpir.optimize.lit_frame import LitFrame
 from warpir.optimize.loop import Optimization
 from warpir.optimize.model import Guided
-from warpir.optimize.view import Frame
+from warpir.optimize.view import Frame, LitFrame
 from warpir.render.picture.photo_scene import scene_of
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
@@ -128,7 +127,7 @@ class Course:
                 folder,
                 prior.unet.config.cross_attention_dim,
                 prior.schedule.prediction_type,
-                self.guided.asked.prompts.photo,
+                self.guided.prompts.photo,
             )
             for path in paths:
                 output.write_bytes(path.name, path.read_bytes())

@@ -43,29 +43,17 @@ LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A model and its prompts."""
-
-    prior: StableDiffusion
-    prompts: Prompts
-
-
-@dataclass(frozen=True)
 class Guided:
     """A model adapted to the photo, ready for guidance."""
 
-    asked: Asked
+    prior: StableDiffusion
+    prompts: Prompts
     learnt: Personalization | None
     """Personalisation to the photo; None where the base model is used."""
     notices: tuple[str, ...]
     checkpoints: Checkpoints
     resumed: Checkpoint | None
     """Checkpoint to resume from, if there is one."""
-
-    @property
-    def prior(self) -> StableDiffusion:
-        """The model."""
-        return self.asked.prior
 
     def state_dict(self) -> dict[str, Any]:
         """Return precision and adapter for a checkpoint of the loop."""
@@ -77,7 +65,7 @@ class Guided:
         prior, learnt = self.prior, self.learnt
         record: dict[str, Any] = {
             "model": {"name": prior.name, "sha256": prior.file_hashes},
-            "prompts": asdict(self.asked.prompts),
+            "prompts": asdict(self.prompts),
         }
         if learnt is not None:
             record["personalization"] = {
@@ -100,8 +88,9 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> Guided:
     """
     config = run.config
     with run.timings.stage("model"):
-        asked = run.memory.again(lambda: load_prior(run), "the model", "--model")
-        prior, prompts = asked.prior, asked.prompts
+        prior = run.memory.again(lambda: load_prior(run), "the model", "--model")
+        assert config.guidance.prompt is not None
+        prompts = make_prompts(config.guidance.prompt, config.adapter)
         use_threads_for(prior.unet)
         shown = config.guidance.show_prior or ()
         prior.embed([prompts.photo, prompts.class_, prompts.guidance, "", *shown])
@@ -110,26 +99,22 @@ def prepare_guidance(run: Run, checkpoints: Checkpoints) -> Guided:
     run.log.say(f"model: {prior.name} {config.diffusion.model}, sha256 {prior.digest[:16]}...")
     resumed = checkpoint_of(run, checkpoints, prior)
     run.log.say(f'guidance asks for "{prompts.guidance}"')
-    guided = adapted(run, asked, checkpoints, resumed)
+    guided = adapted(run, prior, prompts, checkpoints, resumed)
     if resumed is not None and resumed.stage == "optimize":
         # After the adapter, which was rounded as the model was when it came.
         prior.load_state_dict(resumed.state["guided"]["prior"])
     return guided
 
 
-def load_prior(run: Run) -> Asked:
-    """Load the configured prior and its prompts.
+def load_prior(run: Run) -> StableDiffusion:
+    """Load the configured prior.
 
     Raises:
         InputError: Its memory is certain to be short (`ExitCode.RESOURCES`).
         ModelError: It cannot be loaded.
     """
-    config = run.config
-    prompt = config.guidance.prompt
-    assert prompt is not None
     require_memory(run)
-    model = load_stable_diffusion(config.diffusion, run.device, run.memory.in_chunks)
-    return Asked(model, make_prompts(prompt, config.adapter))
+    return load_stable_diffusion(run.config.diffusion, run.device, run.memory.in_chunks)
 
 
 def require_memory(run: Run) -> None:
@@ -165,13 +150,19 @@ def checkpoint_of(run: Run, checkpoints: Checkpoints, prior: StableDiffusion) ->
     return checkpoint
 
 
-def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None) -> Guided:
+def adapted(
+    run: Run,
+    prior: StableDiffusion,
+    prompts: Prompts,
+    checkpoints: Checkpoints,
+    resumed: Checkpoint | None,
+) -> Guided:
     """Adapt a model to the photo if the loss needs it; free its text encoder.
 
     Raises:
         ModelError: The model cannot be adapted.
     """
-    config, prior = run.config, asked.prior
+    config = run.config
     loss, shown = config.guidance.loss, config.guidance.show_prior
     notices: tuple[str, ...] = ()
     does_without = loss in LOSSES_WITHOUT_LORA and config.adapter.lora is None and not shown
@@ -180,14 +171,18 @@ def adapted(run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoin
         notices = (f"--loss {loss} does without a LoRA: none was trained",)
     elif config.adapter.personalize:
         with run.timings.stage("personalize"):
-            learnt = personalized(run, asked, checkpoints, resumed)
+            learnt = personalized(run, prior, prompts, checkpoints, resumed)
         notices = learnt.notices
     prior.free_text_encoder()
-    return Guided(asked, learnt, notices, checkpoints, resumed)
+    return Guided(prior, prompts, learnt, notices, checkpoints, resumed)
 
 
 def personalized(
-    run: Run, asked: Asked, checkpoints: Checkpoints, resumed: Checkpoint | None
+    run: Run,
+    prior: StableDiffusion,
+    prompts: Prompts,
+    checkpoints: Checkpoints,
+    resumed: Checkpoint | None,
 ) -> Personalization:
     """Train the adapter on the photo, and write the images of ``--show-prior``.
 
@@ -196,9 +191,9 @@ def personalized(
     Raises:
         ModelError: The model cannot be adapted.
     """
-    config, prior = run.config, asked.prior
+    config = run.config
     photo = torch.from_numpy(run.inputs.photo.srgb).permute(2, 0, 1)[None].contiguous()
-    given = (prior, photo, asked.prompts, config.adapter, config.render.seed, cache_folder())
+    given = (prior, photo, prompts, config.adapter, config.render.seed, cache_folder())
 
     def on_step(training: Any) -> None:
         if is_due(training.step_count, config.optimize.checkpoint_every):
@@ -222,11 +217,10 @@ def personalized(
 
 def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpdate:
     """Return the guidance of the configured loss over a picture of the frame's size."""
-    config, prior, prompts = run.config, guided.prior, guided.asked.prompts
-    settings = config.guidance
+    config, settings = run.config, run.config.guidance
     guide = kind_of(settings)(
-        prior,
-        prompts.guidance,
+        guided.prior,
+        guided.prompts.guidance,
         settings,
         torch.from_numpy(frame.coverage()),
         config.optimize.step_count,
