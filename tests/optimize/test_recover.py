@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.builders.insertions import ALWAYS, DETAIL, arguments, digest, record_of, write_inputs
-from tests.builders.programs.stops import Killed, stop_at, stop_hard
+from tests.builders.programs.stops import stop_run
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
@@ -140,14 +140,8 @@ STOPS = {
 def test_stopped_run_resumes_as_if_it_had_not_been(
     folder: Path, finished: Path, tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import warpir.optimize.recover
-    import warpir.report.result  # noqa: F401  all modules that are to be stopped in
-
     out = tmp_path / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, *STOPS[where])
-        with pytest.raises(Killed):
-            stop_hard(argv(folder, out))
+    stop_run(argv(folder, out), *STOPS[where])
     assert not (out / "run.json").exists()
     is_kept = any((out / "checkpoints").glob("0*"))
     assert ("--resume goes on from there" in capsys.readouterr().out) == is_kept
@@ -159,13 +153,8 @@ def test_stopped_run_resumes_as_if_it_had_not_been(
 @pytest.fixture
 def unfinished(folder: Path, tmp_path: Path) -> Path:
     """A run that stopped in the optimisation."""
-    import warpir.optimize.recover  # noqa: F401
-
     out = tmp_path / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize.loop:Optimization.step", 6)
-        with pytest.raises(Killed):
-            stop_hard(argv(folder, out))
+    stop_run(argv(folder, out), "optimize.loop:Optimization.step", 6)
     return out
 
 
@@ -206,15 +195,10 @@ def test_resume_refuses_another_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Other weights, schedule, scale and words in the folder that is named as before."""
-    import warpir.optimize.recover  # noqa: F401
-
     model = tmp_path / "model"
     shutil.copytree(folder / "epsilon", model)
     out = tmp_path / "other"
-    with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize.loop:Optimization.step", 6)
-        with pytest.raises(Killed):
-            stop_hard(argv(folder, out, model=str(model)))
+    stop_run(argv(folder, out, model=str(model)), "optimize.loop:Optimization.step", 6)
     weights = model / "unet/diffusion_pytorch_model.safetensors"
     tensors = load_file(weights)
     tensors["conv_out.bias"] += 1e-3
@@ -316,10 +300,7 @@ def test_stopped_overwrite_resumes(folder: Path, finished: Path, tmp_path: Path)
     out = tmp_path / "out"
     assert main(argv(folder, out, seed="5", steps="0", lora_steps="0")) == ExitCode.DONE
     before = results(out)
-    with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize.loop:Optimization.step", 6)
-        with pytest.raises(Killed):
-            stop_hard([*argv(folder, out), "--overwrite"])
+    stop_run([*argv(folder, out), "--overwrite"], "optimize.loop:Optimization.step", 6)
     assert results(out) == before
     assert main([*argv(folder, out), "--resume"]) == ExitCode.DONE
     assert results(out) == results(finished)

@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.light.recovery import TowardTruth
 from tests import oracles as o
 from tests.builders.insertions import ALWAYS, arguments, digest, record_of, write_inputs
-from tests.builders.programs.stops import Killed, stop_at, stop_hard
+from tests.builders.programs.stops import stop_run
 from tests.builders.records import factor_arrays, path_means, plain_factors, shade_vertices
 from tests.builders.refusals import assert_fails
 from tests.builders.shapes import camera, ground, sphere
@@ -28,13 +28,11 @@ from warpir.io.images.photos import Photo
 from warpir.io.meshes.materials_file import materials_to_json, with_materials
 from warpir.lighting.scene_light import SceneLight
 from warpir.optimize import materials as refine_module
-from warpir.optimize.lit_frame import STILL_SAMPLES
 from warpir.optimize.loop import Optimization
 from warpir.optimize.materials import (
     LOWEST,
     Between,
     Factors,
-    LitFrame,
     MaterialRefinement,
     Positive,
     ToneRefinement,
@@ -42,7 +40,7 @@ from warpir.optimize.materials import (
     free_parts,
     what_moves,
 )
-from warpir.optimize.view import Frame
+from warpir.optimize.view import STILL_SAMPLES, Frame, LitFrame
 from warpir.render.bridge import ShadeForeground
 from warpir.render.composite import make_picture
 from warpir.render.device_scene import Placed, Scene
@@ -703,10 +701,7 @@ def test_refinement_judges_with_the_earlier_runs_operator(
 def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path) -> None:
     """A run that stopped in the loop goes on from its checkpoint to the same bytes."""
     out = tmp_path / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        stop_at(patch, "optimize.loop:Optimization.step", 4)
-        with pytest.raises(Killed):
-            stop_hard(argv(folder, out, "material"))
+    stop_run(argv(folder, out, "material"), "optimize.loop:Optimization.step", 4)
     assert main([*argv(folder, out, "material"), "--resume"]) == ExitCode.DONE
     for name in ("composite.png", "materials.json", "optimization.json"):
         assert digest(out)[name] == digest(refined)[name]

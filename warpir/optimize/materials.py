@@ -29,9 +29,9 @@ from warpir.optimize.course import (
     make_frame,
     open_checkpoints,
 )
-from warpir.optimize.lit_frame import LitFrame
 from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
+from warpir.optimize.view import LitFrame
 from warpir.render.bridge import ShadeForeground
 from warpir.render.integrator import MaterialTensors
 from warpir.render.mis.integrator import MisIntegrator

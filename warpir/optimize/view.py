@@ -1,7 +1,8 @@
-"""Differentiable view of the optimisation loop, rendered under every step's light.
+"""Pictures of the optimisation loop: under a light of every step, or under a fixed one.
 
-There are two integrators. `transport` traces once, with samples for an expected light, so that a
-step is a matrix product; it traces again when the light has moved away. `mis` traces every step.
+A `View` renders each step, with gradients to the light. There are two integrators. `transport`
+traces once, with samples for an expected light, so that a step is a matrix product; it traces
+again when the light has moved away. `mis` traces every step.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import FloatArray, IntArray, PixelArray
+from warpir.lighting.scene_light import SceneLight
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.integrator import Integrator, Radiance
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.near.rows import with_lamps
-from warpir.render.renderer import Renderer
+from warpir.render.renderer import Renderer, index_of
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots
 from warpir.render.transport.integrator import TransportIntegrator
@@ -28,6 +30,8 @@ from warpir.scene.light import Light
 
 COVERAGE_SAMPLES = 64
 """Camera samples per pixel of the object's coverage for `mis`."""
+STILL_SAMPLES = 64
+"""Camera samples per pixel of the parts that are rendered once."""
 
 
 @dataclass(frozen=True)
@@ -170,3 +174,53 @@ def expected_light(texels_fg: Tensor, texels_shadow: Tensor) -> Light:
     with torch.no_grad():
         both = [t / t.mean().clamp(min=1e-20) for t in (texels_fg, texels_shadow)]
     return Light(texels=(0.5 * (both[0] + both[1])).cpu().numpy())
+
+
+class LitFrame:
+    """A frame under a fixed light; parts that do not depend on the unknowns are rendered once.
+
+    Args:
+        frame: Scene, photo, tone operator.
+        light: The light.
+        device: Device of the unknowns.
+        samples: Camera samples per pixel.
+
+    Attributes:
+        foreground: The object with its own materials, premultiplied, shape [object_pixel, 3].
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        light: SceneLight,
+        device: torch.device,
+        samples: int = STILL_SAMPLES,
+    ) -> None:
+        self.frame, renderer, seed = frame, frame.renderer, frame.seed
+        self.args_fg = args_shadow = light_args(light.light, renderer.device)
+        if light.light_shadow is not light.light:
+            args_shadow = light_args(light.light_shadow, renderer.device)
+        self.object_pixels = renderer.gbuffer(seed).object_pixels
+        height, width = frame.photo_lin.shape[:2]
+        is_object = (index_of(self.object_pixels, height * width) >= 0).astype(np.int32)
+        proxies = shaded_pixels(renderer, args_shadow, seed)
+        plane = renderer.receiver(args_shadow, proxies, is_object[proxies], samples, 1, seed)
+        seen = renderer.foreground(self.args_fg, self.object_pixels, samples, 1, frame.depth, seed)
+        self.foreground, self.lit, self.unoccluded = (
+            torch.from_numpy(values).to(device)
+            for values in (seen.radiance, plane.lit, plane.unoccluded)
+        )
+        self.constants = ComposeConstants(
+            frame.photo_lin,
+            self.object_pixels,
+            proxies,
+            seen.mask,
+            str(renderer.device.alias),
+            frame.is_reinhard,
+        )
+
+    def image(self, foreground: Tensor, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
+        """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable."""
+        return compose(
+            self.constants, foreground, self.lit, self.unoccluded, curve_fg, curve_shadow
+        )

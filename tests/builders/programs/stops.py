@@ -1,6 +1,6 @@
-"""Ways to stop a run inside a function, softly or hard."""
+"""A run that is stopped hard inside a function."""
 
-import sys
+from importlib import import_module
 from typing import Any
 
 import pytest
@@ -12,10 +12,15 @@ class Killed(BaseException):
     """Stands for SIGKILL: nothing of ours catches it."""
 
 
-def stop_at(monkeypatch: pytest.MonkeyPatch, place: str, count: int) -> None:
-    """Raise at the ``count``-th call of a function of the run."""
+def stop_run(arguments: list[str], place: str, count: int) -> None:
+    """Start a run that ends at the ``count``-th call of a function, as if it had been killed.
+
+    The program's own explanation of exceptions is left out.
+    """
+    from warpir.insert import insert
+
     module, name = place.rsplit(".", 1)
-    owner = sys.modules["warpir." + module.split(":")[0]]
+    owner: Any = import_module("warpir." + module.split(":")[0])
     for part in module.split(":")[1:]:
         owner = getattr(owner, part)
     original, calls = getattr(owner, name), [0]
@@ -26,11 +31,6 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, place: str, count: int) -> None:
             raise Killed
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(owner, name, stopping)
-
-
-def stop_hard(arguments: list[str]) -> None:
-    """Run without the program's own explanation of exceptions."""
-    from warpir.insert import insert
-
-    insert(parse(arguments).config)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(owner, name, stopping)
+        insert(parse(arguments).config)
