@@ -244,8 +244,7 @@ class Checkpoints:
                 for old in list(self._names())[KEPT:]:
                     remove_folder(self.folder / old)
         except OSError as error:
-            what = "a checkpoint cannot be written"
-            raise disk_error(self.folder, error, what) from None
+            raise disk_error(self.folder, error, "a checkpoint cannot be written") from None
 
     def load(self, notice: Callable[[str], None]) -> Checkpoint:
         """Return the newest checkpoint that is whole.
@@ -334,8 +333,7 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
 def _split(state: Any, place: str, tensors: dict[str, Tensor]) -> Any:
     """Move the tensors of a nested state into ``tensors``; return the rest, plain."""
     if isinstance(state, Mapping):
-        parts = {k: _split(v, f"{place}/{k}", tensors) for k, v in state.items()}
-        return {"mapping": parts}
+        return {"mapping": {k: _split(v, f"{place}/{k}", tensors) for k, v in state.items()}}
     if state is None or isinstance(state, str | int | float | list | tuple):
         return {"plain": state}
     # safetensors refuses tensors that share memory.
@@ -356,10 +354,8 @@ def _differences(then: Any, now: Any, place: str = "") -> Iterator[str]:
     """Yield the differences of two plain trees, one line a leaf."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
-            absent = "absent"
-            yield from _differences(
-                then.get(key, absent), now.get(key, absent), f"{place}.{key}".lstrip(".")
-            )
+            one, other = then.get(key, "absent"), now.get(key, "absent")
+            yield from _differences(one, other, f"{place}.{key}".lstrip("."))
     elif then != now:
         yield f"{place}: was {_shown(then)}, is {_shown(now)}"
 

@@ -188,10 +188,9 @@ class KernelCache:
         if kept.name.startswith("."):  # another process is writing it
             return True
         try:
-            digest = hashlib.sha256(kept.read_bytes()).hexdigest()
+            is_whole = kept.suffix == f".{sha256_of(kept)}"
         except FileNotFoundError:  # another process made room
             return True
-        is_whole = kept.suffix == f".{digest}"
         with suppress(OSError):  # a folder that may only be read is used all the same
             if is_whole:
                 os.utime(kept)
