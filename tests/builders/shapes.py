@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from warpir.core.arrays import IntArray
+from warpir.core.arrays import Float64Array, IntArray
 from warpir.render.device_scene import Placed, Receiver
 from warpir.scene.asset import Asset, Material, Primitive, Texture
 from warpir.scene.camera import Camera
@@ -89,6 +89,24 @@ def camera(
 def all_pixels(view: Camera) -> IntArray:
     """Every pixel of a view, row-major."""
     return np.arange(view.width * view.height, dtype=np.int32)
+
+
+def view_rays(view: Camera, side: int = 1) -> Float64Array:
+    """Unit view rays through ``side x side`` places of each pixel, world, [pixel, side^2, 3]."""
+    inner = (np.arange(side) + 0.5) / side
+    rows, columns = np.arange(view.height), np.arange(view.width)
+    v, u, b, a = np.meshgrid(rows, columns, inner, inner, indexing="ij")
+    x, y = (u + a - view.cx) / view.fx, (view.cy - v - b) / view.fy
+    rays = np.stack([x, y, -np.ones_like(x)], axis=-1) @ view.c2w[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return rays.reshape(-1, side * side, 3)
+
+
+def seen_ground(view: Camera, side: int = 1) -> Float64Array:
+    """Where these rays meet the ground y = 0 [m], NaN in the sky, shape [pixel, side^2, 3]."""
+    rays, eye = view_rays(view, side), view.c2w[:3, 3]
+    down = np.where(rays[..., 1:2] < 0.0, rays[..., 1:2], np.nan)
+    return eye - rays * (eye[1] / down)
 
 
 def constant(radiance: ArrayLike = (1.0, 1.0, 1.0), height: int = 8) -> Light:

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from tests.builders.shapes import all_pixels, box, camera, constant, ground, placed, quad, sphere
+from tests.builders.shapes import (
+    all_pixels,
+    box,
+    camera,
+    constant,
+    ground,
+    placed,
+    quad,
+    sphere,
+    view_rays,
+)
 from tests.oracles import fresnel
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.latlong import map_directions
@@ -114,15 +124,6 @@ def mirrored(d: Float64Array, n: Float64Array) -> Float64Array:
     return d - 2.0 * np.einsum("rk,rk->r", d, n)[:, None] * n
 
 
-def pixel_rays(view: Camera, side: int = 8) -> Float64Array:
-    """Unit directions through a grid in each pixel, shape [pixel * side^2, 3]; no turned camera."""
-    g = (np.arange(side) + 0.5) / side
-    v, u, b, a = np.meshgrid(np.arange(view.height), np.arange(view.width), g, g, indexing="ij")
-    d = np.stack([(u + a - view.cx) / view.fx, (view.cy - v - b) / view.fy, -np.ones_like(a)], -1)
-    d = d.reshape(-1, 3)
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
 def through_a_sphere(d: Float64Array, center: Float64Array, ior: float) -> Float64Array:
     """Radiance along rays from the origin that meet a unit sphere of glass, bounce by bounce."""
     along = d @ center
@@ -151,10 +152,9 @@ def test_absorbing_sphere_is_that_of_float64(ior: float, device: str) -> None:
     material = replace(GLASS, ior=ior, **GREEN)
     r = renderer(placed(sphere(center, 1.0, 6), material), view, device)
     found = foreground(r, sloped(), spp=2048).radiance.astype(float)
-    d = pixel_rays(view)
-    near = np.linalg.norm(np.cross(d, center), axis=1)
-    is_inside = (near.reshape(-1, 64) < 0.97).all(axis=1)
-    d = d.reshape(-1, 64, 3)[is_inside]
+    d = view_rays(view, 8)
+    is_inside = (np.linalg.norm(np.cross(d, center), axis=-1) < 0.97).all(axis=1)
+    d = d[is_inside]
     expected = through_a_sphere(d.reshape(-1, 3), center, ior).reshape(-1, 64, 3).mean(axis=1)
     assert is_inside.sum() > 300
     error = found[is_inside] - expected

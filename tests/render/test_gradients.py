@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 from torch.func import functional_call
 
@@ -19,20 +18,20 @@ from tests.builders.records import (
     plane_sums,
     shade_vertices,
 )
+from tests.builders.shapes import box, camera, ground, placed, sphere
 from tests.conftest import devices
 from tests.statistics import compare_gradients
 from warpir.render import renderer as render
 from warpir.render.bridge import ComposeConstants, compose, host_light
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.device_scene import Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ObjectSamples, ReceiverSamples
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
-from warpir.scene.asset import Asset, Material, Primitive
-from warpir.scene.camera import Camera
+from warpir.scene.asset import Material
 
 WIDTH, HEIGHT = 48, 32
 SEED = 3
@@ -59,24 +58,12 @@ LACQUER = Material(
 CLOTH = Material(sheen_color=(0.6, 0.3, 0.2), sheen_roughness=0.5, clearcoat=0.3)
 
 
-def two_objects(*materials: Material) -> Asset:
-    """A sphere of smooth metal paint and a rough box that glows a little; they see each other."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    box = trimesh.creation.box(extents=(0.3, 0.6, 0.3))
-    box.apply_translation((0.7, -0.2, 0.0))
-    return Asset(
-        "two",
-        (
-            Primitive(
-                np.array(ball.vertices),
-                np.array(ball.faces, np.int32),
-                0,
-                normals=np.array(ball.vertex_normals, np.float32),
-            ),
-            Primitive(np.array(box.vertices), np.array(box.faces, np.int32), 1),
-        ),
-        materials or (Material(), Material()),
-    )
+def two_objects(device: str, *materials: Material) -> Scene:
+    """A ball of smooth metal paint and a rough box that glows a little; they see each other."""
+    parts = sphere((0.0, 0.5, -4.0), 0.5, 3), box((0.7, 0.3, -4.0), (0.3, 0.6, 0.3), 1)
+    thing = placed(parts, *(materials or (Material(), Material())))
+    view = camera(WIDTH, HEIGHT, 40.0, (0.0, 1.0, 0.0))
+    return Scene([thing], view, ground(0.0), device)
 
 
 @dataclass
@@ -173,15 +160,7 @@ def some_texels(generator: torch.Generator) -> Tensor:
 
 def make_pipeline(device: str, depth: int, *materials: Material, bounce_depth: int = 0) -> Pipeline:
     """Set the two objects on the ground, of materials whose free factors are replaced."""
-    focal = 40.0
-    pose = np.eye(4)
-    pose[1, 3] = 1.0
-    camera = Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, pose)
-    stand = np.eye(4)
-    stand[:3, 3] = [0.0, 0.5, -4.0]
-    proxy = Receiver(np.array([0.0, 1.0, 0.0]), 0.0)
-    scene = Scene([Placed(two_objects(*materials), stand)], camera, proxy, device)
-    renderer = Renderer(scene, bounce_depth=bounce_depth)
+    renderer = Renderer(two_objects(device, *materials), bounce_depth=bounce_depth)
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:

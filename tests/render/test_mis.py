@@ -16,21 +16,18 @@ from tests.builders.records import (
     plane_sums,
     shade_vertices,
 )
-from tests.render.test_gradients import two_objects
+from tests.render.test_gradients import HEIGHT, WIDTH, two_objects
 from tests.statistics import compare_gradients
 from warpir.core.arrays import Float64Array
 from warpir.render import renderer as render
 from warpir.render.bridge import host_light
 from warpir.render.device_light import light_args
-from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
 from warpir.render.mis import samples as samples_module
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.mis.samples import ObjectSamples, ReceiverSamples
 from warpir.render.renderer import Renderer
-from warpir.scene.camera import Camera
 
-WIDTH, HEIGHT = 48, 32
 SEED = 5
 SEEDS = 12
 SUMS_L2 = 1e-5
@@ -52,16 +49,9 @@ def one_thread_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def integrator(device: str, threads: int = 0, spp: int = 4, depth: int = 3) -> MisIntegrator:
     """A ball and a box on the ground, in all pixels."""
-    pose = np.eye(4)
-    pose[1, 3] = 1.0
-    camera = Camera(WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2, pose)
-    stand = np.eye(4)
-    stand[:3, 3] = [0.0, 0.5, -4.0]
-    scene = Scene(
-        [Placed(two_objects(), stand)], camera, Receiver(np.array([0.0, 1.0, 0.0]), 0.0), device
-    )
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.int32)
-    return MisIntegrator(Renderer(scene, threads), pixels, pixels, spp, 2, depth)
+    renderer = Renderer(two_objects(device), threads)
+    return MisIntegrator(renderer, pixels, pixels, spp, 2, depth)
 
 
 def leaf(values: object) -> Tensor:

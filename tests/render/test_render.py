@@ -1,9 +1,11 @@
 """The renderer: closed forms, furnaces, linearity, shadows, geometry and determinism."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -18,6 +20,7 @@ from tests.builders.shapes import (
     lobe,
     placed,
     quad,
+    seen_ground,
     sphere,
 )
 from tests.oracles import (
@@ -221,19 +224,23 @@ def test_mirror_shows_the_map_where_it_is(device: str) -> None:
 # ------------------------------------------------------------------- linearity in the light
 
 
-def two_shapes() -> list[Primitive]:
-    """A ball and a box that see each other and stand on y = 0, materials 0 and 1."""
-    return [sphere((-0.6, 0.5, -4.0), 0.5, 3), box((0.6, 0.4, -4.2), (0.8, 0.8, 0.8), 1)]
-
-
-def stand(device: str, threads: int = 0, height: float = 0.0) -> Renderer:
-    """Two shapes of two materials on the ground, seen from eye height."""
-    objects = placed(
-        two_shapes(),
+def two_shapes(matrix: ArrayLike | None = None) -> Placed:
+    """A ball and a box of two materials that see each other and stand on y = 0."""
+    return placed(
+        [sphere((-0.6, 0.5, -4.0), 0.5, 3), box((0.6, 0.4, -4.2), (0.8, 0.8, 0.8), 1)],
         Material(base_color=(0.9, 0.6, 0.3), metallic=1.0, roughness=0.3),
         Material(base_color=(0.3, 0.5, 0.8), metallic=0.0, roughness=0.6),
+        matrix=matrix,
     )
-    return make(objects, camera(24, 16, 24.0, (0.0, 1.0, 0.0), -8.0), device, height, threads)
+
+
+EYE_HEIGHT = camera(24, 16, 24.0, (0.0, 1.0, 0.0), -8.0)
+"""What sees them."""
+
+
+def stand(device: str, threads: int = 0) -> Renderer:
+    """The two shapes on the ground."""
+    return make(two_shapes(), EYE_HEIGHT, device, 0.0, threads)
 
 
 def uneven_map() -> FloatArray:
@@ -288,9 +295,7 @@ def from_above(width: int, height: int, metres: float, at: tuple[float, float] =
 
 def foot(view: Camera) -> Float64Array:
     """The plane's x and z under each pixel's centre, shape [pixel, 2]."""
-    d, eye = centre_rays(view)
-    points = eye - d * (eye[1] / d[..., 1:2])
-    return points.reshape(-1, 3)[:, [0, 2]]
+    return seen_ground(view)[:, 0, [0, 2]]
 
 
 @pytest.mark.parametrize(
@@ -301,9 +306,8 @@ def foot(view: Camera) -> Float64Array:
 def test_shadow_ratio_is_exactly_one_where_nothing_is_blocked(device: str, light: Light) -> None:
     """An empty scene, and an object wholly below the plane: lit and unoccluded agree bit by bit."""
     below = placed(box((0.0, -2.0, -4.0), (1.0, 1.0, 1.0)))
-    view = camera(24, 16, 24.0, (0.0, 1.0, 0.0), -8.0)
     for objects in ([], [below]):
-        renderer = Renderer(Scene(objects, view, ground(0.0), device))
+        renderer = make(objects, EYE_HEIGHT, device, 0.0)
         ratio, lit, unoccluded = shadow(renderer, light, sees=1)
         np.testing.assert_array_equal(ratio, 1.0)
         np.testing.assert_array_equal(lit, unoccluded)
@@ -437,11 +441,10 @@ def test_sheet_on_the_ground_is_seen_whole(device: str) -> None:
         view = camera(16, 16, focal, (0.3, 1.5, 0.0), -np.degrees(np.arctan(1.5 / distance)))
         renderer = make(sheet, view, device, 0.0)
         out = render(renderer, constant(), 16)
-        d, eye = centre_rays(view)
-        at = eye - d * (eye[1] / d[..., 1:2])
-        inside = (np.abs(at[..., 0] - 0.3) < 0.8) & (np.abs(at[..., 2] + distance) < 0.5)
+        x, z = foot(view).T
+        inside = (np.abs(x - 0.3) < 0.8) & (np.abs(z + distance) < 0.5)
         assert inside.sum() > 5
-        np.testing.assert_array_equal(out.mask.reshape(16, 16)[inside], 1.0)
+        np.testing.assert_array_equal(out.mask[inside], 1.0)
 
 
 def test_plane_hides_what_is_below_it(device: str) -> None:
@@ -544,20 +547,11 @@ def test_every_32_bit_seed_is_accepted(device: str, seed: int) -> None:
 
 def moved(shift: tuple[float, float, float], factor: float, device: str) -> Renderer:
     """`stand`, grown by ``factor`` about the origin and then moved, with camera and ground."""
-    near = stand(device)
     matrix = np.diag([factor, factor, factor, 1.0])
     matrix[:3, 3] = shift
-    pose = near.scene.camera.c2w.copy()
+    pose = EYE_HEIGHT.c2w.copy()
     pose[:3, 3] = factor * pose[:3, 3] + np.array(shift)
-    view = near.scene.camera
-    view = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose)
-    objects = placed(
-        two_shapes(),
-        Material(base_color=(0.9, 0.6, 0.3), metallic=1.0, roughness=0.3),
-        Material(base_color=(0.3, 0.5, 0.8), metallic=0.0, roughness=0.6),
-        matrix=matrix,
-    )
-    return make(objects, view, device, shift[1])
+    return make(two_shapes(matrix), replace(EYE_HEIGHT, c2w=pose), device, shift[1])
 
 
 @pytest.mark.parametrize(
@@ -613,7 +607,7 @@ def roofed(device: str, *materials: Material, color: FloatArray | None = None) -
     roofs = []
     for k in range(len(materials)):
         plain = quad((0, 1.0 + k, 0), (5.0, 0, 0), (0, 0, -5.0), k)
-        roofs.append(Primitive(plain.positions, plain.indices, k, uv0=plain.uv0, colors=color))
+        roofs.append(replace(plain, colors=color))
     renderer = make(placed(roofs, *materials), from_above(4, 4, 0.5), device, 0.0)
     return shadow(renderer, OVERHEAD)[0]
 
@@ -715,7 +709,7 @@ def test_two_single_sided_cards_in_one_place_are_seen_from_both_sides(
     if diagonal == "other":
         back = quad((0, 0, -5.0), (-1, 0, 0), (0, 1, 0), 1)
     else:
-        back = Primitive(front.positions, front.indices[:, ::-1].copy(), 1, uv0=front.uv0)
+        back = replace(front, indices=front.indices[:, ::-1].copy(), material=1)
     glow = [
         Material(base_color=(0, 0, 0), metallic=1.0, emission=e)
         for e in ((3.0, 1.0, 2.0), (0.5, 4.0, 0.25))
@@ -764,7 +758,7 @@ def test_vertex_colors_multiply_the_base_color(device: str) -> None:
     plain = quad((0, 0, -5.0), (1, 0, 0), (0, 1, 0))
     colors = np.ones((4, 4), np.float32)
     colors[:, 0] = [0.0, 1.0, 1.0, 0.0]  # red rises to the right
-    tinted = Primitive(plain.positions, plain.indices, 0, uv0=plain.uv0, colors=colors)
+    tinted = replace(plain, colors=colors)
     pixels = np.full((1, 1, 4), 255, np.uint8)
     pixels[..., 1] = 188
     material = Material(base_color=(0.5, 0.5, 0.25), base_color_texture=TextureSlot(0))
@@ -828,13 +822,7 @@ def test_second_uv_set_is_used_where_asked(device: str) -> None:
     pixels = np.zeros((1, 2, 4), np.uint8)
     pixels[0, 1] = 255
     for uv_set, value in ((0, 0.0), (1, 1.0)):
-        both = Primitive(
-            plain.positions,
-            plain.indices,
-            0,
-            uv0=np.full((4, 2), 0.0, np.float32),
-            uv1=np.full((4, 2), 1.0, np.float32),
-        )
+        both = replace(plain, uv0=np.zeros((4, 2), np.float32), uv1=np.ones((4, 2), np.float32))
         material = Material(base_color_texture=TextureSlot(0, uv_set))
         texture = Texture(pixels, "clamp", "clamp")
         scene = placed(both, material, textures=(texture,))
@@ -864,7 +852,7 @@ def test_flat_normal_map_changes_nothing(device: str) -> None:
     ball = sphere((0, 0, -5.0), 1.0)
     lon = np.arctan2(ball.positions[:, 0], ball.positions[:, 2] + 5.0) / (2.0 * np.pi)
     uv = np.stack([lon, 0.5 - 0.5 * ball.positions[:, 1]], axis=1).astype(np.float32)
-    ball = Primitive(ball.positions, ball.indices, 0, normals=ball.normals, uv0=uv)
+    ball = replace(ball, uv0=uv)
     without = make(placed(ball, WHITE_METAL), SPHERE_VIEW, device)
     for scale, angle in ((0.0, 0.01), (1.0, 0.4)):
         material = Material(roughness=0.5, normal_texture=TextureSlot(0), normal_scale=scale)
@@ -890,14 +878,7 @@ def test_normal_map_tilts_along_its_texture(device: str, given: bool, flip: floa
         uv[:, 0] = 1.0 - uv[:, 0]
     tangents = np.tile(np.array([flip, 0.0, 0.0, flip], np.float32), (4, 1))
     normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (4, 1))
-    lying = Primitive(
-        plain.positions,
-        plain.indices,
-        0,
-        normals=normals,
-        tangents=tangents if given else None,
-        uv0=uv,
-    )
+    lying = replace(plain, normals=normals, tangents=tangents if given else None, uv0=uv)
     for code, scale in (((255, 128, 255), 1.0), ((128, 255, 255), 1.0), ((255, 128, 255), 0.5)):
         pixels = np.full((1, 1, 4), (*code, 255), np.uint8)
         material = Material(normal_texture=TextureSlot(0), normal_scale=scale)

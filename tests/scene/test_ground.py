@@ -22,7 +22,7 @@ from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.free_space import Cloud, Stand, find_place
 from warpir.scene.ground import fit_ground, in_view
-from warpir.scene.placement import Placement, place_asset, y_to
+from warpir.scene.placement import Placement, place_asset
 
 CAMERA = camera_from_fov(640, 480, 60.0, -8.0, 1.7)
 NOISE = 0.02
@@ -320,13 +320,6 @@ def test_no_free_place_is_refused(rng: np.random.Generator) -> None:
             cloud_of(points),
         )
     assert caught.value.where == "--ground-points"
-
-
-def test_rotation_to_level_is_the_inverse(rng: np.random.Generator) -> None:
-    """What `make_world` levels with: the normal becomes +Y."""
-    normal = rng.normal(size=3)
-    normal /= np.linalg.norm(normal)
-    np.testing.assert_allclose(y_to(normal).T @ normal, [0, 1, 0], atol=1e-12)
 
 
 # ------------------------------------------------------------------------- from files to placement

@@ -9,7 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.builders.shapes import all_pixels, box, camera, ground, placed, quad, sphere
+from tests.builders.shapes import (
+    all_pixels,
+    box,
+    camera,
+    ground,
+    placed,
+    quad,
+    seen_ground,
+    sphere,
+)
 from warpir.core.arrays import Float64Array
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
@@ -154,16 +163,6 @@ def slopes(
     return [part.astype(np.float64) for part in found]
 
 
-def points_below(view: Camera) -> Float64Array:
-    """Ground at 8 x 8 places of each pixel of `DOWN`, shape [pixel, 64, 3]."""
-    u, v = np.meshgrid(np.arange(view.width), np.arange(view.height))
-    inner = (np.arange(8) + 0.5) / 8
-    du, dv = (a.reshape(-1) for a in np.meshgrid(inner, inner))
-    x, y = (a.reshape(-1, 1) + d for a, d in ((u, du), (v, dv)))
-    scale = view.c2w[1, 3] / view.fx
-    return np.stack([(x - view.cx) * scale, 0.0 * x, (y - view.cy) * scale], axis=-1)
-
-
 def visible(lamp: Lamp, point: Float64Array) -> float:
     """Irradiance by radiance 1 of a lamp beside the card: Lambert's sum over what is in view.
 
@@ -208,7 +207,7 @@ def test_place_of_a_lamp_above_ground_and_card_is_that_of_closed_forms(
     lambert = Material(base_color=(0.6, 0.5, 0.25), metallic=0.0, specular=0.0, roughness=1.0)
     card = placed(quad((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, -0.5)), lambert)
     shown, _, unoccluded = slopes(card, lamp, DOWN, device, 512, 0)
-    middles = points_below(DOWN).mean(axis=1)
+    middles = seen_ground(DOWN, 8).mean(axis=1)
 
     def closed(center: Float64Array) -> Float64Array:
         moved = replace(lamp, center=center)
@@ -231,7 +230,7 @@ def test_place_moves_a_penumbra(kind: int, device: str) -> None:
     card = placed(quad((-1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
     _, lit, unoccluded = slopes(card, lamp, DOWN, device, 4096, 0)
     row = slice(8 * DOWN.width, 9 * DOWN.width)
-    points = points_below(DOWN)[row, ::7]
+    points = seen_ground(DOWN, 8)[row, ::7]
     step = 1e-4 * np.eye(3)
 
     def closed(center: Float64Array) -> Float64Array:

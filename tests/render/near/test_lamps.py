@@ -13,6 +13,7 @@ from tests.builders.shapes import (
     lobe,
     placed,
     quad,
+    seen_ground,
     sphere,
 )
 from warpir.core.arrays import Float64Array
@@ -69,14 +70,6 @@ def receiver(
     return r.receiver(args, pixels, np.full(len(pixels), hides, np.int32), spp, 1, seed)
 
 
-def points_below(view: Camera) -> Float64Array:
-    """Ground at the middles of the pixels of `DOWN`, shape [pixel, 3]."""
-    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    scale = view.c2w[1, 3] / view.fx
-    x, z = (u - view.cx) * scale, (v - view.cy) * scale
-    return np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
-
-
 MATERIALS = {
     "lambert": LAMBERT,
     "gloss": Material(base_color=(0.6, 0.5, 0.25), metallic=0.0, roughness=0.3),
@@ -128,7 +121,7 @@ def test_lamps_fall_off_on_object_and_ground(kind: int, height: float, device: s
     on_card = foreground(renderer(placed(card, LAMBERT), [lamp], DOWN, device, ground()), spp=256)
     below = placed(quad((50.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     on_ground = receiver(renderer(below, [lamp], DOWN, device), spp=256)
-    expected = np.array([irradiance(lamp, p, UP) for p in points_below(DOWN)]) / np.pi
+    expected = np.array([irradiance(lamp, p, UP) for p in seen_ground(DOWN)[:, 0]]) / np.pi
     np.testing.assert_allclose(on_card.radiance, COLOR * expected, rtol=0.02)
     np.testing.assert_allclose(on_ground.lit, expected, rtol=0.02)
     assert (on_ground.lit == on_ground.unoccluded).all()
@@ -144,7 +137,7 @@ def test_lamps_penumbra_is_the_part_of_the_lamp_in_view(kind: int, device: str) 
     found = receiver(renderer(placed(card), [lamp], DOWN, device), spp=1024, hides=0)
     expected, whole = [], []
     g = (np.arange(400) + 0.5) / 400
-    for p in points_below(DOWN):
+    for p in seen_ground(DOWN)[:, 0]:
         if kind == 0:
             z, phi = (a.reshape(-1) for a in np.meshgrid(2.0 * g - 1.0, 2.0 * np.pi * g))
             r = np.sqrt(1.0 - z * z)
@@ -195,7 +188,7 @@ def test_lamps_on_the_ground_light_it_and_shine_no_way_through(device: str) -> N
     lamp = SphereLamp(np.array([0.05, 0.0, 0.02]), 0.1, POWER)
     far = placed(quad((50.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     found = receiver(renderer(far, [lamp], DOWN, device), spp=1024)
-    points = points_below(DOWN)
+    points = seen_ground(DOWN)[:, 0]
     expected = np.array([irradiance(lamp, p, UP) for p in points]) / np.pi
     away = np.linalg.norm(points - lamp.center, axis=1)
     clear = np.abs(away - lamp.radius) > 0.03  # no pixel across the lamp's edge
@@ -244,8 +237,7 @@ def test_lamps_are_shaded_by_the_receivers_mesh_and_by_glass(device: str) -> Non
     low = camera(24, 16, 24.0, (0.0, 0.4, 4.0), pitch=-15.0)
     hidden = receiver(renderer(thing, [lamp], low, device, under))
     inside = receiver(renderer(thing, [lamp], low, device))
-    below = points_ahead(low)
-    near = np.abs(below).max(axis=1) < 1.0
+    near = np.abs(seen_ground(low)[:, 0]).max(axis=1) < 1.0
     assert near.any() and hidden.unoccluded[near].max() == 0.0 < inside.unoccluded[near].min()
     pane = Material(base_color=(1.0, 1.0, 1.0), alpha=0.25, alpha_mode="BLEND")
     wide = placed(quad((0.0, 0.5, 0.0), (9.0, 0.0, 0.0), (0.0, 0.0, -9.0)), pane)
@@ -257,15 +249,6 @@ def test_lamps_are_shaded_by_the_receivers_mesh_and_by_glass(device: str) -> Non
     seen = free.unoccluded[:, 0] > 0.0
     np.testing.assert_allclose(free.lit[seen], free.unoccluded[seen], rtol=1e-6)
     np.testing.assert_allclose(dimmed.lit[seen], 0.75 * dimmed.unoccluded[seen], rtol=1e-5)
-
-
-def points_ahead(view: Camera) -> Float64Array:
-    """Ground at the middles of the pixels, far away where a pixel shows none, shape [pixel, 3]."""
-    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], axis=-1)
-    rays = local.reshape(-1, 3) @ view.c2w[:3, :3].T
-    t = np.where(rays[:, 1] < 0.0, -view.c2w[1, 3] / np.minimum(rays[:, 1], -1e-9), 1e9)
-    return view.c2w[:3, 3] + t[:, None] * rays
 
 
 def test_lamps_shade_a_picture_by_the_pixel(device: str) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, camera, constant, ground, placed, sphere
+from tests.builders.shapes import all_pixels, camera, constant, ground, placed, sphere, view_rays
 from tests.render.test_picture import QUALITY, bent, picture
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.render.composite import UNCHANGED
@@ -37,23 +37,9 @@ def image_of(
     return image - behind
 
 
-def rays(side: int) -> Float64Array:
-    """Unit view rays of a grid of positions in each pixel, shape [pixel, side^2, 3]."""
-    sub = (np.arange(side) + 0.5) / side
-    v, u = np.divmod(all_pixels(VIEW), VIEW.width)
-    v = v[:, None, None] + sub[:, None]
-    u = u[:, None, None] + sub
-    u, v = np.broadcast_arrays(u, v)
-    local = np.stack(
-        [(u - VIEW.cx) / VIEW.fx, (VIEW.cy - v) / VIEW.fy, np.full(u.shape, -1.0)], axis=-1
-    )
-    world = local.reshape(len(u), -1, 3) @ VIEW.c2w[:3, :3].T
-    return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
-
-
 def mirrored(radius: float, side: int = 24) -> tuple[Float64Array, Float64Array]:
     """Return F where a mirror shows the ball, else 0, and F; means over each pixel's ground."""
-    ray = rays(side)
+    ray = view_rays(VIEW, side)
     down = ray[..., 1]
     sees = down < 0.0
     t = np.where(sees, -VIEW.c2w[1, 3] / np.where(sees, down, -1.0), 0.0)
@@ -116,7 +102,7 @@ def test_white_ball_in_a_furnace_is_not_seen_in_the_mirror(device: str, roughnes
 def test_coat_under_a_black_dome_loses_its_albedo(device: str, roughness: float) -> None:
     """Where every reflection meets a black wall, the image is minus the coat's albedo."""
     added = image_of(device, LAMBERT, constant(), roughness, 500.0, 1024)[:, 0]
-    cos_o = -rays(8)[..., 1].mean(axis=1)
+    cos_o = -view_rays(VIEW, 8)[..., 1].mean(axis=1)
     pixels = np.flatnonzero(cos_o > 0.15)[::17]
     expected = np.array([o.coat_albedo(c, roughness**2) for c in cos_o[pixels]])
     np.testing.assert_allclose(-added[pixels], expected, rtol=0.04)

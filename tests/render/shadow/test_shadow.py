@@ -5,15 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.builders.shapes import all_pixels, camera, constant, ground, lobe, placed, quad, sphere
-from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from tests.builders.shapes import (
+    all_pixels,
+    camera,
+    constant,
+    ground,
+    lobe,
+    placed,
+    quad,
+    seen_ground,
+    sphere,
+)
+from warpir.core.arrays import FloatArray, IntArray
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Receiver, Scene
 from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.picture import BEND, picture_ratio
 from warpir.render.shadow.pilot import run_pilot
-from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.receiver import mesh_of
 
@@ -28,16 +37,6 @@ def ball(device: str, bounce_depth: int = 0, receiver: Receiver | None = None) -
     thing = placed(sphere((0.0, HEIGHT, 0.0), RADIUS, detail=5))
     scene = Scene([thing], VIEW, receiver or ground(0.0), device)
     return Renderer(scene, bounce_depth=bounce_depth)
-
-
-def seen_ground(view: Camera) -> Float64Array:
-    """Points of the ground at the pixels' centres, NaN at the sky, shape [pixel, 3]."""
-    x, y = np.arange(view.width) + 0.5 - view.cx, np.arange(view.height) + 0.5 - view.cy
-    u, v = np.meshgrid(x / view.fx, -y / view.fy)
-    rays = np.stack([u, v, -np.ones_like(u)], axis=-1).reshape(-1, 3) @ view.c2w[:3, :3].T
-    eye = view.c2w[:3, 3]
-    t = np.where(rays[:, 1] < 0.0, -eye[1] / rays[:, 1], np.nan)
-    return eye + t[:, None] * rays
 
 
 def ratio_everywhere(
@@ -60,7 +59,7 @@ def test_loss_under_an_even_sky_is_the_balls_form_factor(device: str) -> None:
     Siegel and Howell, "Thermal Radiation Heat Transfer".
     """
     renderer = ball(device)
-    point = seen_ground(VIEW)
+    point = seen_ground(VIEW)[:, 0]
     pixels = np.flatnonzero(np.isfinite(point[:, 0]))[::37].astype(np.int32)
     to_ball = np.array([0.0, HEIGHT, 0.0]) - point[pixels]
     distance = np.linalg.norm(to_ball, axis=1)
