@@ -144,6 +144,11 @@ def test_no_temporary_folder_is_a_full_disk(
 # Compiled kernels
 
 
+def files_in(folder: Path) -> list[Path]:
+    """What a cache of kernels holds."""
+    return [file for file in folder.rglob("*.*") if file.is_file()]
+
+
 def compile_into(cache: KernelCache, name: str = "wp_a_1", content: bytes = b"code") -> Path:
     """Do as Warp does when it compiles a module."""
     folder = cache.folder / VERSION / name
@@ -155,8 +160,8 @@ def compile_into(cache: KernelCache, name: str = "wp_a_1", content: bytes = b"co
 
 def seen_by(cache: KernelCache) -> dict[str, bytes]:
     """What Warp finds in its folder."""
-    files = (cache.folder / VERSION).rglob("*.*")
-    return {f"{f.parent.name}/{f.name}": f.read_bytes() for f in files if f.is_file()}
+    files = files_in(cache.folder / VERSION)
+    return {f"{f.parent.name}/{f.name}": f.read_bytes() for f in files}
 
 
 @pytest.fixture
@@ -171,7 +176,7 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_next_process_finds_what_one_has_compiled(store: Path) -> None:
     """Binary and description, by their sha256; nothing is kept twice."""
-    names = sorted(file.name for file in store.rglob("*.*") if file.is_file())
+    names = sorted(file.name for file in files_in(store))
     digests = [hashlib.sha256(b"code" + s).hexdigest() for s in (b".cpu12.o", b".meta")]
     assert names == [f"wp_a_1.cpu12.o.{digests[0]}", f"wp_a_1.meta.{digests[1]}"]
     again = KernelCache(VERSION)
@@ -180,7 +185,7 @@ def test_next_process_finds_what_one_has_compiled(store: Path) -> None:
     compile_into(again, "wp_b_2")
     again.keep()
     again.keep()
-    assert len([file for file in store.rglob("*.*") if file.is_file()]) == 4
+    assert len(files_in(store)) == 4
     assert seen_by(KernelCache("1.3")) == {}
     assert take_notices() == ()
 
@@ -193,12 +198,11 @@ def test_cache_of_kernels_keeps_within_its_size(
         os.utime(file, (0, 0))
     monkeypatch.setattr(caches, "KERNEL_BYTES", 24)
     cache = KernelCache("1.2")
-    for file in store.rglob("*.*"):
-        if file.is_file():
-            os.utime(file, (0, 0))
+    for file in files_in(store):
+        os.utime(file, (0, 0))
     compile_into(cache, "wp_b_2")
     cache.keep()
-    assert {file.parent.name for file in store.rglob("*.*") if file.is_file()} == {"wp_b_2"}
+    assert {file.parent.name for file in files_in(store)} == {"wp_b_2"}
 
 
 @pytest.mark.parametrize(
@@ -297,12 +301,12 @@ print(values.numpy().tolist(), *take_notices())
 DOUBLED = "[0.0, 2.0, 4.0, 6.0]"
 
 
-def start(folder: Path, **env: str) -> subprocess.Popen[str]:
+def start(folder: Path) -> subprocess.Popen[str]:
     """Start a process that compiles a small kernel, or finds it."""
     script = folder / "kernel.py"
     if not script.exists():  # a process started before may be about to read it
         script.write_text(KERNEL)
-    own = {"WARP_CACHE_PATH": str(folder / "kernels"), "TMPDIR": str(folder / "tmp"), **env}
+    own = {"WARP_CACHE_PATH": str(folder / "kernels"), "TMPDIR": str(folder / "tmp")}
     return subprocess.Popen(
         [sys.executable, str(script)],
         cwd=folder,
@@ -313,22 +317,26 @@ def start(folder: Path, **env: str) -> subprocess.Popen[str]:
     )
 
 
+def said(process: subprocess.Popen[str]) -> str:
+    """Return what a process printed; it ended well."""
+    out, err = process.communicate(timeout=200)
+    assert (process.returncode, err) == (0, "")
+    return out.strip()
+
+
 @pytest.mark.slow
 @pytest.mark.case("R9")
 def test_eight_cold_processes_share_a_cache(tmp_path: Path) -> None:
     """All compile at once, all are right, and what they leave is whole: the next two read it."""
     cold = [start(tmp_path) for _ in range(8)]
-    for process in cold:
-        out, err = process.communicate(timeout=200)
-        assert (process.returncode, out.strip(), err) == (0, DOUBLED, "")
-    kept = {f: f.stat().st_mtime_ns for f in (tmp_path / "kernels").rglob("*.*") if f.is_file()}
+    assert [said(process) for process in cold] == [DOUBLED] * 8
+    kept = files_in(tmp_path / "kernels")
     assert any(".o." in file.name for file in kept)
     for file in kept:
         if not file.parent.name.startswith("warpir") and file.suffix:
             assert hashlib.sha256(file.read_bytes()).hexdigest() == file.suffix[1:]
-    out, err = start(tmp_path).communicate(timeout=100)
-    assert (out.strip(), err) == (DOUBLED, "")
-    assert {f for f in (tmp_path / "kernels").rglob("*.*") if f.is_file()} == set(kept)
+    assert said(start(tmp_path)) == DOUBLED
+    assert set(files_in(tmp_path / "kernels")) == set(kept)
     assert not list((tmp_path / "tmp").iterdir()), "temporary caches are left"
 
 
@@ -336,12 +344,10 @@ def test_eight_cold_processes_share_a_cache(tmp_path: Path) -> None:
 @pytest.mark.case("R9")
 def test_warp_loads_no_damaged_module(tmp_path: Path) -> None:
     """Junk of which Warp 1.19 would end the process is compiled again, with a notice."""
-    assert start(tmp_path).communicate(timeout=100)[0].strip() == DOUBLED
+    assert said(start(tmp_path)) == DOUBLED
     for file in (tmp_path / "kernels").rglob("*.o.*"):
         file.write_bytes(file.read_bytes()[:200])
-    process = start(tmp_path)
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0 and err == ""
+    out = said(start(tmp_path))
     assert out.startswith(DOUBLED) and "1 damaged" in out
 
 
@@ -350,9 +356,7 @@ def test_warp_loads_no_damaged_module(tmp_path: Path) -> None:
 def test_warp_without_a_cache(tmp_path: Path) -> None:
     """A file in its place: compiled for this process only, which leaves nothing behind."""
     (tmp_path / "kernels").write_text("in the way")
-    process = start(tmp_path)
-    out, err = process.communicate(timeout=100)
-    assert process.returncode == 0 and err == ""
+    out = said(start(tmp_path))
     assert out.startswith(DOUBLED) and "compiled for this run only" in out
     assert (tmp_path / "kernels").read_text() == "in the way"
     assert not list((tmp_path / "tmp").iterdir())
