@@ -1,7 +1,9 @@
 """Checkpoints: what is written comes back, damage is passed over, another run is refused."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -54,45 +56,38 @@ def test_checkpoint_keeps_two_and_the_newest_is_the_last_written(tmp_path: Path)
     assert checkpoints.load(pytest.fail).step == 75
 
 
-DAMAGES = ("cut", "flip", "no state", "manifest cut", "no key", "no manifest", "newer format")
+def rewritten(manifest: bytes, change: Callable[[dict[str, Any]], object]) -> bytes:
+    """A manifest whose content was changed."""
+    content = json.loads(manifest)
+    change(content)
+    return json.dumps(content).encode()
 
 
-@pytest.mark.parametrize(
-    "damage", [pytest.param(damage, id=f"R3-{damage.replace(' ', '-')}") for damage in DAMAGES]
-)
+DAMAGES: dict[str, tuple[str, Callable[[bytes], bytes | None]]] = {
+    "cut": (STATE, lambda held: held[: len(held) // 2]),
+    "flip": (STATE, lambda held: held[:-1] + bytes([held[-1] ^ 1])),
+    "no-state": (STATE, lambda held: None),
+    "manifest-cut": (MANIFEST, lambda held: held[:-20]),
+    "no-key": (MANIFEST, lambda held: rewritten(held, lambda m: m.pop("state"))),
+    "no-manifest": (MANIFEST, lambda held: None),
+    "newer-format": (MANIFEST, lambda held: rewritten(held, lambda m: m.update(format=FORMAT + 1))),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids="R3-{}".format)
 def test_checkpoint_damaged_is_passed_over(tmp_path: Path, damage: str) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
     checkpoints.save("optimize", 100, a_state(2))
-    newest = tmp_path / "checkpoints" / "000002-optimize-100"
-    content = (newest / STATE).read_bytes()
-    manifest = json.loads((newest / MANIFEST).read_text())
-    if damage == "cut":
-        (newest / STATE).write_bytes(content[: len(content) // 2])
-    elif damage == "flip":
-        (newest / STATE).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    elif damage == "no state":
-        (newest / STATE).unlink()
-    elif damage == "manifest cut":
-        (newest / MANIFEST).write_bytes((newest / MANIFEST).read_bytes()[:-20])
-    elif damage == "no manifest":
-        (newest / MANIFEST).unlink()
-    elif damage == "newer format":
-        (newest / MANIFEST).write_text(json.dumps(manifest | {"format": FORMAT + 1}))
-    else:
-        del manifest["state"]
-        (newest / MANIFEST).write_text(json.dumps(manifest))
+    name, spoil = DAMAGES[damage]
+    file = tmp_path / "checkpoints" / "000002-optimize-100" / name
+    spoilt = spoil(file.read_bytes())
+    file.unlink()
+    if spoilt is not None:
+        file.write_bytes(spoilt)
     notices: list[str] = []
     assert checkpoints.load(notices.append).step == 50
     assert len(notices) == 1 and "000002-optimize-100" in notices[0]
-
-
-def test_checkpoint_without_manifest_is_not_forgotten(tmp_path: Path) -> None:
-    checkpoints = Checkpoints(tmp_path, IDENTITY)
-    checkpoints.save("optimize", 50, a_state(1))
-    (tmp_path / "checkpoints" / "000001-optimize-50" / MANIFEST).unlink()
-    with pytest.raises(InputError, match="000001-optimize-50 cannot be used: no such file"):
-        checkpoints.load(pytest.fail)
 
 
 def test_checkpoint_of_another_run_names_every_field(tmp_path: Path) -> None:
@@ -113,8 +108,12 @@ def test_checkpoint_of_another_run_names_every_field(tmp_path: Path) -> None:
 def test_checkpoint_all_damaged_says_so(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, IDENTITY)
     checkpoints.save("optimize", 50, a_state(1))
-    (tmp_path / "checkpoints" / "000001-optimize-50" / STATE).write_bytes(b"")
+    only = tmp_path / "checkpoints" / "000001-optimize-50"
+    (only / STATE).write_bytes(b"")
     with pytest.raises(InputError, match="its sha256 is not the one"):
+        checkpoints.load(pytest.fail)
+    (only / MANIFEST).unlink()
+    with pytest.raises(InputError, match="000001-optimize-50 cannot be used: no such file"):
         checkpoints.load(pytest.fail)
 
 
@@ -147,11 +146,8 @@ def test_checkpoint_with_an_edited_manifest_is_passed_over(tmp_path: Path, key: 
     checkpoints = Checkpoints(tmp_path, {"seed": 3})
     checkpoints.save("optimize", 3, {"step": 3})
     path = tmp_path / "checkpoints" / "000001-optimize-3" / "manifest.json"
-    manifest = json.loads(path.read_text())
-    manifest[key] = {"stage": "lora", "step": 7, "identity": {"seed": 4}, "state": {"plain": 7}}[
-        key
-    ]
-    path.write_text(json.dumps(manifest))
+    other = {"stage": "lora", "step": 7, "identity": {"seed": 4}, "state": {"plain": 7}}
+    path.write_bytes(rewritten(path.read_bytes(), lambda m: m.update({key: other[key]})))
     with pytest.raises(InputError, match="sha256"):
         checkpoints.load(print)
 

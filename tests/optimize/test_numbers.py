@@ -42,9 +42,9 @@ from warpir.render import bad_pixels
 from warpir.render.bad_pixels import NAMED, BadPixels
 from warpir.render.device import Rows
 from warpir.render.device_light import light_args
+from warpir.render.integrator import Radiance
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
-from warpir.render.tone_curve import Knots
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -188,69 +188,45 @@ class Toward(Pull):
         return image - 0.5
 
 
-Planted = Callable[[LightOptimization, Callable[[], bool]], None]
+def plant(owner: Any, name: str, now: Callable[[], bool], spoil: Callable[[Any], Any]) -> None:
+    """Spoil what a method returns at some times."""
+    own = getattr(owner, name)
+    setattr(owner, name, lambda *given: spoil(own(*given)) if now() else own(*given))
+
+
+def with_nan(values: Tensor, *place: int) -> Tensor:
+    bad = torch.zeros_like(values)
+    bad[place] = NAN
+    return values + bad
 
 
 def plant_gradient(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop.guide.gradient
-
-    def gradient(image: Tensor, step: int) -> Tensor | None:
-        d_image = own(image, step)
-        if now() and d_image is not None:
-            d_image[0, 1, 3, 5] = NAN
-        return d_image
-
-    loop.guide.gradient = gradient  # type: ignore[method-assign]
+    plant(loop.guide, "gradient", now, lambda d_image: with_nan(d_image, 0, 1, 3, 5))
 
 
 def plant_loss(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop.composite
+    def spoil(found: Composite) -> Composite:
+        term = found.terms["consistency"][1]
+        return replace(found, terms=found.terms | {"consistency": (1.0, term * NAN)})
 
-    def composite(step: int) -> Composite:
-        found = own(step)
-        if now():
-            found.terms["consistency"] = (1.0, found.terms["consistency"][1] * NAN)
-        return found
-
-    loop.composite = composite  # type: ignore[method-assign]
+    plant(loop, "composite", now, spoil)
 
 
 def plant_texel(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop._separate
-
-    def separate(height: int) -> tuple[Tensor, Tensor]:
-        maps = own(height)
-        if not now():
-            return maps
-        bad = torch.zeros_like(maps[0])
-        bad[4, 7, 0] = NAN
-        return maps[0] + bad, maps[1]
-
-    loop._separate = separate  # type: ignore[method-assign]
+    plant(loop, "_separate", now, lambda maps: (with_nan(maps[0], 4, 7, 0), maps[1]))
 
 
 def plant_curve(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop.unknowns.curve_fg.forward
-
-    def forward() -> Knots:
-        knots = own()
-        return Knots(knots.x, knots.y * NAN, knots.slope) if now() else knots
-
-    loop.unknowns.curve_fg.forward = forward  # type: ignore[method-assign]
+    curve = loop.unknowns.curve_fg
+    plant(curve, "forward", now, lambda knots: replace(knots, y=knots.y * NAN))
 
 
 def plant_radiance(loop: LightOptimization, now: Callable[[], bool]) -> None:
-    own = loop.view.radiance
+    def spoil(found: Radiance) -> Radiance:
+        middle = len(found.foreground) // 2
+        return replace(found, foreground=with_nan(found.foreground, middle))
 
-    def radiance(*given: Any) -> Any:
-        found = own(*given)
-        if not now():
-            return found
-        bad = torch.zeros_like(found.foreground)
-        bad[len(bad) // 2] = NAN
-        return replace(found, foreground=found.foreground + bad)
-
-    loop.view.radiance = radiance  # type: ignore[method-assign]
+    plant(loop.view, "radiance", now, spoil)
 
 
 def plant_emission(loop: LightOptimization, now: Callable[[], bool]) -> None:
@@ -261,8 +237,7 @@ def plant_emission(loop: LightOptimization, now: Callable[[], bool]) -> None:
         assert rows is not None
         clean = rows.emission
         if now():
-            rows.emission = clean.clone()
-            rows.emission[len(clean) // 2] = NAN
+            rows.emission = with_nan(clean, len(clean) // 2)
         found = own(*given)
         rows.emission = clean
         return found
@@ -270,7 +245,7 @@ def plant_emission(loop: LightOptimization, now: Callable[[], bool]) -> None:
     loop.view.radiance = radiance  # type: ignore[method-assign]
 
 
-PLACES: dict[str, Planted] = {
+PLACES = {
     "gradient": plant_gradient,
     "loss": plant_loss,
     "env-texel": plant_texel,
