@@ -191,7 +191,12 @@ class Toward(Pull):
 def plant(owner: Any, name: str, now: Callable[[], bool], spoil: Callable[[Any], Any]) -> None:
     """Spoil what a method returns at some times."""
     own = getattr(owner, name)
-    setattr(owner, name, lambda *given: spoil(own(*given)) if now() else own(*given))
+
+    def planted(*given: Any, **named: Any) -> Any:
+        found = own(*given, **named)
+        return spoil(found) if now() else found
+
+    setattr(owner, name, planted)
 
 
 def with_nan(values: Tensor, *place: int) -> Tensor:
@@ -226,23 +231,23 @@ def plant_radiance(loop: LightOptimization, now: Callable[[], bool]) -> None:
         middle = len(found.foreground) // 2
         return replace(found, foreground=with_nan(found.foreground, middle))
 
-    plant(loop.view, "radiance", now, spoil)
+    plant(loop.view.integrator, "radiance", now, spoil)
 
 
 def plant_emission(loop: LightOptimization, now: Callable[[], bool]) -> None:
     """What the rows hold as emitted, for a step."""
-    own, rows = loop.view.radiance, loop.view.transport
+    own, rows = loop.view.integrator.radiance, loop.view.transport
 
-    def radiance(*given: Any) -> Any:
+    def radiance(*given: Any, **named: Any) -> Any:
         assert rows is not None
         clean = rows.emission
         if now():
             rows.emission = with_nan(clean, len(clean) // 2)
-        found = own(*given)
+        found = own(*given, **named)
         rows.emission = clean
         return found
 
-    loop.view.radiance = radiance  # type: ignore[method-assign]
+    loop.view.integrator.radiance = radiance  # type: ignore[method-assign]
 
 
 PLACES = {

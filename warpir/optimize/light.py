@@ -232,7 +232,9 @@ class LightOptimization(Optimization):
         """Return the inputs of the composite; by torch alone with `transport`."""
         unknowns, maps = self.unknowns, self._separate(self.settings.light_height)
         curves = unknowns.curve_fg(), unknowns.curve_shadow()
-        radiance = self.view.radiance(*self._fused(maps, scale), seed, unknowns.lamp_powers())
+        radiance = self.view.integrator.radiance(
+            *self._fused(maps, scale), seed, lamp_powers=unknowns.lamp_powers()
+        )
         return Parts(radiance, *curves, self._terms(maps, curves))
 
     def _fused(self, maps: tuple[Tensor, Tensor], scale: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -359,9 +361,8 @@ class LightOptimization(Optimization):
         """Restore `state_dict`; light transport is traced again or read from the cache."""
         super().load_state_dict(state)
         self.retraced = state["retraced"]
-        expected = Light(texels=state["expected"].numpy())
         if not torch.equal(state["expected"], torch.from_numpy(self.expected.texels)):
-            self.expected = expected
+            self.expected = Light(texels=state["expected"].numpy())
             self.view = self._trace()
 
 

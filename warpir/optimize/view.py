@@ -68,7 +68,8 @@ class View:
         cache: Folder for traced rows, or None.
 
     Attributes:
-        transport: The integrator whose rows were traced, or None.
+        integrator: What renders.
+        transport: The same if its rows were traced, or None.
     """
 
     def __init__(
@@ -122,18 +123,8 @@ class View:
             seed: Seed of this step's samples; `transport` has none.
             lamp_powers: Relative [W], shape [lamp, 3]; None: those of the scene's lamps.
         """
-        radiance = self.radiance(texels_fg, texels_shadow, seed, lamp_powers)
+        radiance = self.integrator.radiance(texels_fg, texels_shadow, seed, lamp_powers=lamp_powers)
         return self.compose(radiance, curve_fg, curve_shadow)
-
-    def radiance(
-        self,
-        texels_fg: Tensor,
-        texels_shadow: Tensor,
-        seed: int,
-        lamp_powers: Tensor | None = None,
-    ) -> Radiance:
-        """Return the integrator's radiance; arguments are those of `image`."""
-        return self.integrator.radiance(texels_fg, texels_shadow, seed, lamp_powers=lamp_powers)
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
