@@ -16,7 +16,7 @@ from warpir.train.networks.regressor import random_regressor, read_regressor, sa
 from warpir.train.places import of_fold, place_of, some_places
 from warpir.train.regressor import join_members
 from warpir.train.sampler import Sampler
-from warpir.train.scenes.layout import misjudged_rays, rays_in
+from warpir.train.scenes.layout import Views, misjudged
 
 NAMES = [f"{place}_{kind}" for place in "abcdefghijk" for kind in ("noon", "night")]
 
@@ -61,11 +61,11 @@ def test_a_misjudged_camera_keeps_its_yaw() -> None:
     """On average the rays are the true ones, and what is ahead stays ahead."""
     count = 4000
     draw = Sampler(count, torch.Generator().manual_seed(0))
-    window = torch.tensor([-0.6, -0.4, 1.2, 0.8]).expand(count, 4)
-    axes = tuple(torch.eye(3)[k].expand(count, 3) for k in range(3))
-    rays = misjudged_rays(draw, window, (4, 6), axes)
+    zero, axes = torch.zeros(count), (torch.eye(3)[k].expand(count, 3) for k in range(3))
+    views = Views(torch.zeros(count, 3), *axes, zero, zero + 0.6, zero + 0.4)
+    rays = misjudged(draw, views).rays((4, 6))
     torch.testing.assert_close(rays.norm(dim=1), torch.ones(count, 4, 6))
-    truth = rays_in(window[:1], (4, 6), *(axis[:1] for axis in axes))
+    truth = views.rays((4, 6))[:1]
     angle = torch.rad2deg(torch.acos((rays * truth).sum(dim=1).clamp(-1.0, 1.0)))
     assert 2.0 < float(angle.mean()) < 6.0
     middle = rays[:, :, 1:3, 2:4].mean(dim=(2, 3))

@@ -29,8 +29,8 @@ def batches(count, generator):
     seen.append(generator.initial_seed())
     return blobs(count, generator)
 
-end = train_regressor(batches, HELD_OUT, out, replace(TOY, step_limit=3), worker.device("cpu"),
-                      5.0, 5.0, network=network)
+end = train_regressor(batches, HELD_OUT, out, replace(TOY, step_limit=3), "cpu", 5.0, 5.0,
+                      network=network)
 total = sum(float(p.double().sum()) for p in network.parameters())
 (out / f"rank-{{worker.rank}}").write_text(f"{{total.hex()}} {{seen[0]}} {{end.steps}}")
 """

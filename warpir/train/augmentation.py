@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -25,16 +25,13 @@ def mirror(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
     def turned(plain: Tensor, reflected: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *(1,) * (plain.dim() - 1)), reflected, plain)
 
-    return PhotoBatch(
+    return replace(
+        batch,
         photo=turned(batch.photo, batch.photo.flip(3)),
         rays=turned(batch.rays, batch.rays.flip(3) * sign.view(1, 3, 1, 1)),
         axis=turned(batch.axis, batch.axis * sign),
-        share=batch.share,
-        sun=batch.sun,
-        sigma=batch.sigma,
         # x = sin(lon) and lon = pi (1 - 2u): negating x turns the columns about.
         ambient=turned(batch.ambient, batch.ambient.flip(2)),
-        has_cue=batch.has_cue,
     )
 
 
@@ -58,9 +55,7 @@ def stretch(batch: PhotoBatch, chosen: Tensor, generator: torch.Generator) -> Ph
     grid = F.affine_grid(theta, list(batch.photo.shape), align_corners=False)
     both = torch.cat([batch.photo, batch.rays], dim=1)
     both = F.grid_sample(both, grid, padding_mode="border", align_corners=False)
-    return PhotoBatch(
-        **_parts(batch) | {"photo": both[:, :3], "rays": F.normalize(both[:, 3:], dim=1)}
-    )
+    return replace(batch, photo=both[:, :3], rays=F.normalize(both[:, 3:], dim=1))
 
 
 def discolour(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
@@ -75,13 +70,11 @@ def discolour(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
     grey = grey.clamp(min=0.0)[:, None].expand_as(batch.photo) ** (1.0 / GAMMA)
     sun = (batch.sun @ weights)[:, None].expand_as(batch.sun)
     ambient = (batch.ambient @ weights)[..., None].expand_as(batch.ambient)
-    return PhotoBatch(
-        **_parts(batch)
-        | {
-            "photo": torch.where(chosen[:, None, None, None], grey, batch.photo),
-            "sun": torch.where(chosen[:, None], sun, batch.sun),
-            "ambient": torch.where(chosen[:, None, None, None], ambient, batch.ambient),
-        }
+    return replace(
+        batch,
+        photo=torch.where(chosen[:, None, None, None], grey, batch.photo),
+        sun=torch.where(chosen[:, None], sun, batch.sun),
+        ambient=torch.where(chosen[:, None, None, None], ambient, batch.ambient),
     )
 
 
@@ -121,8 +114,4 @@ def augment(
     photo = erase(batch.photo, settings.erase_share, generator)
     size = torch.rand(len(photo), 1, 1, 1, device=device, generator=generator) * settings.noise
     photo = photo + size * torch.randn(photo.shape, device=device, generator=generator)
-    return PhotoBatch(**_parts(batch) | {"photo": photo.clamp(0.0, 1.0)})
-
-
-def _parts(batch: PhotoBatch) -> dict[str, Tensor]:
-    return {f.name: getattr(batch, f.name) for f in fields(PhotoBatch)}
+    return replace(batch, photo=photo.clamp(0.0, 1.0))

@@ -143,8 +143,15 @@ class LightPool:
         return replace(self, **joined)
 
 
+def at_mean_luminance(texels: FloatArray) -> FloatArray:
+    """Return a map scaled to mean luminance 1, which changes nothing in a photograph of it."""
+    omega = texel_solid_angles(*texels.shape[:2])[:, None]
+    mean = float((luminance(texels.astype(np.float64)) * omega).sum() / (4.0 * np.pi))
+    return (texels / max(mean, 1e-20)).astype(np.float32)
+
+
 def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
-    """Read panoramas; each is scaled to mean luminance 1, which changes nothing in a photograph.
+    """Read panoramas, each scaled to mean luminance 1.
 
     Raises:
         InputError: A file cannot be used.
@@ -152,10 +159,7 @@ def load_panoramas(paths: list[Path], device: torch.device | str) -> LightPool:
     seen, fine, splits = [], [], []
     paths = sorted(paths, key=lambda path: (SKY_ONLY in path.stem, path.stem))
     for path in paths:
-        texels = read_envmap(path)
-        omega = texel_solid_angles(*texels.shape[:2])[:, None]
-        mean = float((luminance(texels.astype(np.float64)) * omega).sum() / (4.0 * np.pi))
-        texels = (texels / max(mean, 1e-20)).astype(np.float32)
+        texels = at_mean_luminance(read_envmap(path))
         split = split_sun(resize_map(texels, SPLIT_HEIGHT))
         splits.append(split)
         fine.append(resize_map(split.rest, HEIGHT))

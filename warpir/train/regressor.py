@@ -95,8 +95,7 @@ def train_regressor(
         record: Put into the weights file beside what is known here; plain values.
 
     Raises:
-        InputError: Nothing to resume from, no checkpoint that is whole, or ``out`` holds a training
-            that was begun.
+        InputError: Nothing to resume from, or no checkpoint that is whole.
     """
     began, device, worker = time.monotonic(), torch.device(device), Worker.this()
     with worker.joined(device):
@@ -104,7 +103,9 @@ def train_regressor(
         if resume:
             run = _Run.resumed(out, settings, device)
         else:
-            run = _Run.begun(out, network or random_regressor(seed), settings, device, worker)
+            run = _Run(out, network or random_regressor(seed), settings, device)
+            if worker.is_first:
+                (out / CURVE).unlink(missing_ok=True)
         first = run.step
         is_complete = run.go(batches, validation, worker, seed, began, minutes, total_minutes)
         finished: dict[str, dict[str, float]] = {}
@@ -179,27 +180,6 @@ class _Run:
         self.step, self.minutes, self.best = 0, 0.0, math.inf
         self.losses: dict[str, Tensor] = {}
         """Running means of the terms of the loss."""
-
-    @classmethod
-    def begun(
-        cls,
-        out: Path,
-        network: RegressorModule,
-        settings: TrainingSettings,
-        device: torch.device,
-        worker: Worker,
-    ) -> _Run:
-        """Start a training in a folder that holds none.
-
-        Raises:
-            InputError: The folder holds the checkpoints of a training.
-        """
-        if checkpoints_of(out).newest is not None:
-            advice = "resume it, or give another folder"
-            raise InputError(out, "holds a training that was begun", advice, ExitCode.OUTPUT)
-        if worker.is_first:
-            (out / CURVE).unlink(missing_ok=True)
-        return cls(out, network, settings, device)
 
     @classmethod
     def resumed(cls, out: Path, settings: TrainingSettings, device: torch.device) -> _Run:

@@ -49,10 +49,7 @@ def measure(
 
     Angles, their likelihood and coverage are over sunny photos with a cue.
     """
-    return _measure(_answers(network, loss, batches), loss)
-
-
-def _measure(answers: _Answers, loss: LightLoss) -> dict[str, float]:
+    answers = _answers(network, loss, batches)
     prediction, targets, chosen = answers.prediction, answers.targets, answers.counts
     error = loss.irradiance_error(loss.ambient(prediction), targets["ambient"])
     measured = {

@@ -34,10 +34,6 @@ class Worker:
         """Whether this process is the one that validates and writes."""
         return self.rank == 0
 
-    def device(self, kind: str) -> torch.device:
-        """Return the device of this process: ``cpu``, or the GPU of its own."""
-        return torch.device(kind, self.local_rank) if kind == "cuda" else torch.device(kind)
-
     @contextmanager
     def joined(self, device: torch.device) -> Iterator[None]:
         """Join the other processes within this context, where there are any."""

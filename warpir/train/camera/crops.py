@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from warpir.calibration.network import HEIGHT, WIDTH, blur_sigma
-from warpir.core.color import luminance
-from warpir.core.latlong import resize_map, texel_solid_angles
+from warpir.core.latlong import resize_map
 from warpir.io.images.photos import read_envmap
 from warpir.train.augmentation import erase
+from warpir.train.lights import at_mean_luminance
 from warpir.train.networks.calibrator import SHAPE, soften
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
@@ -142,9 +141,7 @@ def read_panoramas(paths: Sequence[Path], device: torch.device | str) -> Panoram
     for k, path in enumerate(paths):
         texels = read_envmap(path)
         coarseness.append(max(1.0, ROWS / texels.shape[0]))
-        omega = texel_solid_angles(*texels.shape[:2])[:, None]
-        mean = float((luminance(texels.astype(np.float64)) * omega).sum() / (4.0 * np.pi))
-        texels = resize_map((texels / max(mean, 1e-20)).astype(np.float32), ROWS)
+        texels = resize_map(at_mean_luminance(texels), ROWS)
         stack[0, :, k, :, 1:-1] = torch.from_numpy(texels).permute(2, 0, 1)
     stack[..., 0], stack[..., -1] = stack[..., -2], stack[..., 1]
     return Panoramas(stack.to(device), torch.tensor(coarseness, device=device))

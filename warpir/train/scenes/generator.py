@@ -20,7 +20,7 @@ from warpir.train.batches import PhotoBatch
 from warpir.train.lights import LightPool, make_lights
 from warpir.train.photo_look import draw_faults, draw_looks
 from warpir.train.sampler import Sampler
-from warpir.train.scenes.layout import draw_grounds, draw_stands, draw_views, misjudged_rays
+from warpir.train.scenes.layout import draw_grounds, draw_stands, draw_views, misjudged
 from warpir.train.scenes.lighting import Lighting, draw_directions, lighting_of, to_map
 from warpir.train.scenes.render import Scenes, render
 from warpir.train.scenes.solids import draw_solids
@@ -82,7 +82,7 @@ class SceneGenerator:
         made = render(scenes, PHOTO_SIZE)
         look = draw_looks(made.radiance, generator)
         photo = draw_faults(look.show(made.radiance), generator)
-        light, rays = scenes.lighting, scenes.rays(PHOTO_SIZE)
+        light, rays = scenes.lighting, scenes.views.rays(PHOTO_SIZE)
         ambient = self._rest_map(light) * look.gain[:, None, None]
         sun = light.sun * look.gain
         rest = (luminance(ambient) * solid_angles(ambient)).sum(dim=(1, 2))
@@ -93,9 +93,7 @@ class SceneGenerator:
         has_cue = (share > 0.15) & (scenes.is_panorama | in_view | shows_solid)
         draw = Sampler(count, generator)
         is_misjudged = draw.chance(self.mixture.misjudged)[:, None, None, None]
-        axes = scenes.right, scenes.up, scenes.back
-        wrong = misjudged_rays(draw, scenes.window, PHOTO_SIZE, axes)
-        rays = torch.where(is_misjudged, wrong, rays)
+        rays = torch.where(is_misjudged, misjudged(draw, scenes.views).rays(PHOTO_SIZE), rays)
         return PhotoBatch(
             photo, rays, light.axis, share, sun, light.sigma,
             ambient, has_cue,
@@ -131,17 +129,14 @@ class SceneGenerator:
         )  # fmt: skip
         seen = torch.where(made_up, -1, lights)
         ground = draw_grounds(draw, is_panorama, seen, views.height, panoramas)
-        axes = {"right": views.right, "up": views.up, "back": views.back}
         tables: dict[str, Any] = {
-            "views": {"origin": views.origin, **axes, "window": views.window},
+            "views": vars(views) | {"window": views.window},
             "maps": {"light": pool.fine, "seen": pool.seen},
             "solids": solids,
             "ground": ground,
             "light": draw_directions(light, pool.fine, generator),
         }
-        return Scenes(
-            tables=tables, lighting=light, **axes, window=views.window, is_panorama=is_panorama
-        )
+        return Scenes(tables, light, views, is_panorama)
 
     def _draw_light(self, draw: Sampler, pool: LightPool) -> tuple[Lighting, Tensor, Tensor]:
         """Draw each scene's light; also whether it is made up, and whether a panorama crop."""

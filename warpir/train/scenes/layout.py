@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -43,27 +43,21 @@ class Views:
         w, h = self.half_width, self.half_height
         return torch.stack([-w, -h, 2.0 * w, 2.0 * h], dim=1)
 
+    def rays(self, size: tuple[int, int]) -> Tensor:
+        """Return the unit viewing directions of the photo's pixels, world frame, [B, 3, H, W].
 
-def rays_in(
-    window: Tensor, size: tuple[int, int], right: Tensor, up: Tensor, back: Tensor
-) -> Tensor:
-    """Return the unit viewing directions of a window's pixels, world frame, shape [B, 3, H, W].
-
-    Args:
-        window: Left, upper, width and height on the image plane at depth 1, shape [B, 4].
-        size: Height and width [px].
-        right: Unit axis of the cameras, shape [B, 3].
-        up: Likewise.
-        back: Likewise.
-    """
-    height, width = size
-    across = (torch.arange(width, device=window.device) + 0.5) / width
-    down = (torch.arange(height, device=window.device) + 0.5) / height
-    u = (window[:, 0:1] + across * window[:, 2:3])[:, None, :, None]
-    v = (window[:, 1:2] + down * window[:, 3:4])[:, :, None, None]
-    right, up, back = (x[:, None, None] for x in (right, up, back))
-    rays = torch.nn.functional.normalize(right * u - up * v - back, dim=-1)
-    return rays.permute(0, 3, 1, 2).contiguous()
+        Args:
+            size: Height and width [px].
+        """
+        height, width = size
+        window, device = self.window, self.origin.device
+        across = (torch.arange(width, device=device) + 0.5) / width
+        down = (torch.arange(height, device=device) + 0.5) / height
+        u = (window[:, 0:1] + across * window[:, 2:3])[:, None, :, None]
+        v = (window[:, 1:2] + down * window[:, 3:4])[:, :, None, None]
+        right, up, back = (x[:, None, None] for x in (self.right, self.up, self.back))
+        rays = torch.nn.functional.normalize(right * u - up * v - back, dim=-1)
+        return rays.permute(0, 3, 1, 2).contiguous()
 
 
 def turned_about(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
@@ -78,32 +72,26 @@ def turned_about(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
     return angle.cos()[:, None] * vector + angle.sin()[:, None] * across
 
 
-def misjudged_rays(
-    draw: Sampler, window: Tensor, size: tuple[int, int], axes: tuple[Tensor, Tensor, Tensor]
-) -> Tensor:
-    """Return the viewing directions that a camera estimated from the photo would give.
+def misjudged(draw: Sampler, views: Views) -> Views:
+    """Return the cameras as estimates from their photos would have them.
 
     Pitch, roll and field of view are off as estimates are; the yaw stays, since the frame is the
     camera's own.
-
-    Args:
-        draw: For the scenes of the batch.
-        window: Of the photo on the image plane, shape [B, 4].
-        size: Height and width [px].
-        axes: The true right, up and back, shape [B, 3] each.
-
-    Returns:
-        Unit directions, camera-yaw frame, shape [B, 3, H, W].
     """
-    right, up, back = axes
     pitch, roll = (torch.deg2rad(sigma * draw.normal()) for sigma in (4.0, 2.0))
     # About +X of the camera-yaw frame: what is ahead stays ahead.
-    level = torch.zeros_like(right)
+    level = torch.zeros_like(views.right)
     level[:, 0] = 1.0
-    right, up, back = (_rotated(level, v, pitch) for v in (right, up, back))
-    right, up = turned_about(back, right, roll), turned_about(back, up, roll)
+    right, up, back = (_rotated(level, v, pitch) for v in (views.right, views.up, views.back))
     zoom = torch.exp((0.12 * draw.normal()).clamp(-0.4, 0.4))
-    return rays_in(window * zoom[:, None], size, right, up, back)
+    return replace(
+        views,
+        right=turned_about(back, right, roll),
+        up=turned_about(back, up, roll),
+        back=back,
+        half_width=views.half_width * zoom,
+        half_height=views.half_height * zoom,
+    )
 
 
 def _rotated(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:

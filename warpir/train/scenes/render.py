@@ -17,7 +17,7 @@ from warpir.kernels.training.scene import (
     OccluderTable,
     ViewTable,
 )
-from warpir.train.scenes.layout import rays_in
+from warpir.train.scenes.layout import Views
 from warpir.train.scenes.lighting import Lighting
 
 SIDE = 2
@@ -31,17 +31,9 @@ class Scenes:
     tables: dict[str, Any]
     """Arguments of the kernel."""
     lighting: Lighting
-    right: Tensor
-    up: Tensor
-    back: Tensor
-    window: Tensor
-    """Left, upper, width and height of the photo on the image plane at depth 1, shape [B, 4]."""
+    views: Views
     is_panorama: Tensor
     """Bool: the photo is a panorama crop."""
-
-    def rays(self, size: tuple[int, int]) -> Tensor:
-        """Return the photos' unit viewing directions, shape [B, 3, height, width]."""
-        return rays_in(self.window, size, self.right, self.up, self.back)
 
 
 @dataclass(frozen=True)
@@ -61,9 +53,9 @@ def render(scenes: Scenes, size: tuple[int, int]) -> Rendered:
         scenes: What is rendered.
         size: Height and width [px].
     """
-    (height, width), count = size, len(scenes.window)
+    (height, width), count = size, len(scenes.is_panorama)
     tables, x = scenes.tables, scenes.lighting
-    pixels, device = count * height * width, scenes.window.device
+    pixels, device = count * height * width, scenes.is_panorama.device
     radiance, solid = torch.empty(pixels, 3, device=device), torch.empty(pixels, device=device)
     light = (
         tables["light"]
