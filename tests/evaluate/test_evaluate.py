@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from warpir.app.config import InsertConfig
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
@@ -32,6 +33,9 @@ from warpir.evaluate.scenes import (
     Place,
     Places,
     Subject,
+    crop_camera,
+    crop_radiance,
+    expose,
     find_files,
     mirrored,
 )
@@ -46,6 +50,7 @@ from warpir.train.networks.regressor import random_regressor, save_regressor
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
 """Azimuth and elevation of the made-up panoramas' suns [deg]."""
 WIDTH = 64
+Scenes = list[tuple[Place, list[Subject]]]
 
 
 def panorama(azimuth: float, elevation: float) -> FloatArray:
@@ -86,7 +91,7 @@ def make_places(data: Path, seed: int = 5, response: str = "gamma") -> Places:
 
 
 @pytest.fixture(scope="module")
-def scenes(data: Path) -> list[tuple[Place, list[Subject]]]:
+def scenes(data: Path) -> Scenes:
     return make_places(data).make(3)
 
 
@@ -94,18 +99,15 @@ def sunlit(subject: Subject, samples: int = 32) -> Stage:
     return Stage(subject, "cpu", Quality(samples, 2, 2, 1, 8.0))
 
 
-def make_bench(scenes: list[tuple[Place, list[Subject]]]) -> Bench:
-    from warpir.app.config import InsertConfig
-
-    return Bench(scenes, "cpu", 0, InsertConfig(), random_regressor(3).regressor())
+def make_bench(data: Path, scenes: Scenes) -> Bench:
+    config = InsertConfig(regressor=str(data / "regressor.safetensors"))
+    return Bench(scenes, "cpu", 0, config)
 
 
 # ---------------------------------------------------------------------------------------- scenes
 
 
-def test_scenes_follow_from_the_seed_alone(
-    data: Path, scenes: list[tuple[Place, list[Subject]]]
-) -> None:
+def test_scenes_follow_from_the_seed_alone(data: Path, scenes: Scenes) -> None:
     """Fewer scenes are the first ones of more; another seed gives others."""
     again = make_places(data).make(2)
     for (place, subjects), (same, others) in zip(scenes, again, strict=False):
@@ -155,7 +157,7 @@ def test_objects_stand_in_view_at_the_stated_size(data: Path) -> None:
         assert [m.metallic for m in glossy.asset.materials] == [1.0]
 
 
-def test_the_camera_frame_has_ahead_at_minus_z(scenes: list[tuple[Place, list[Subject]]]) -> None:
+def test_the_camera_frame_has_ahead_at_minus_z(scenes: Scenes) -> None:
     """A sun at azimuth a, seen by a camera turned to b, is at a - b in the camera-yaw frame."""
     for place, _ in scenes:
         turned = place.to_camera(place.texels)
@@ -170,8 +172,6 @@ def test_the_camera_frame_has_ahead_at_minus_z(scenes: list[tuple[Place, list[Su
 
 def test_photographs_are_the_light_at_its_exposure(data: Path) -> None:
     """What is not clipped decodes to radiance times exposure, through the camera's response."""
-    from warpir.evaluate.scenes import crop_radiance
-
     for response in RESPONSES:
         place, _ = make_places(data, response=response).make(1)[0]
         seen = crop_radiance(panorama(*SUNS[place.panorama]), place.camera) * place.exposure
@@ -209,9 +209,7 @@ def test_a_mirrored_light_has_left_and_right_exchanged() -> None:
 # ------------------------------------------------------------------------------------------ rows
 
 
-def test_the_fitted_exposure_undoes_a_dimmed_light(
-    scenes: list[tuple[Place, list[Subject]]],
-) -> None:
+def test_the_fitted_exposure_undoes_a_dimmed_light(scenes: Scenes) -> None:
     """The same random numbers make radiance linear in the light, so the factor is exact."""
     place, (diffuse, _) = scenes[0]
     stage = sunlit(diffuse)
@@ -238,9 +236,7 @@ def test_identity_curves_are_the_gamma_response_and_not_the_filmic_one(data: Pat
         assert np.abs(stage.truth - stage.place.photo)[outside].max() < 1e-5
 
 
-def test_the_tone_floor_is_below_reinhard_alone(
-    scenes: list[tuple[Place, list[Subject]]],
-) -> None:
+def test_the_tone_floor_is_below_reinhard_alone(scenes: Scenes) -> None:
     _, (diffuse, _) = scenes[1]
     stage = sunlit(diffuse, 8)
 
@@ -250,21 +246,15 @@ def test_the_tone_floor_is_below_reinhard_alone(
     assert error(stage.tone_floor()) < 0.05 * error(Curves.identity("reinhard"))
 
 
-def test_the_brightest_region_is_where_the_sun_is_seen(
-    scenes: list[tuple[Place, list[Subject]]],
-) -> None:
+def test_the_brightest_region_is_where_the_sun_is_seen(data: Path, scenes: Scenes) -> None:
     """A panorama turned so that its sun is in the picture."""
-    from dataclasses import replace
-
-    from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
-
     azimuth, elevation = SUNS["north"]
     camera = crop_camera(96, 64, 80.0, azimuth - 15.0, 0.0, 1.6)
     photo, _ = expose(crop_radiance(panorama(azimuth, elevation), camera))
     place = replace(scenes[0][0], camera=camera, photo=photo.astype(np.float32))
     found = ROWS["brightest-region"].of_place
     assert found is not None
-    lobes = found(make_bench(scenes), place).light.lobes
+    lobes = found(make_bench(data, scenes), place).light.lobes
     assert lobes is not None
     assert lobes.axis[0] @ axis_from_angles(azimuth, elevation) > np.cos(np.radians(5.0))
 
@@ -287,9 +277,7 @@ def test_rows_are_named_or_chosen_by_group() -> None:
         chosen_rows("predictions", False)
 
 
-def test_the_true_light_has_no_error_and_a_turned_one_has_its_angle(
-    scenes: list[tuple[Place, list[Subject]]],
-) -> None:
+def test_the_true_light_has_no_error_and_a_turned_one_has_its_angle(scenes: Scenes) -> None:
     place = scenes[0][0]
     errors = light_figures(place, place.texels)
     assert errors["light.peak_angle_deg"] == 0.0
@@ -474,7 +462,7 @@ def test_main_says_in_a_line_what_is_wrong(
 def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -> None:
     """With one panorama there is no other scene."""
     good = data / "panoramas" / "east" / "east.exr"
-    bench = make_bench(Places([good], [data / "assets" / "cube.ply"], 0, WIDTH).make(2))
+    bench = make_bench(data, Places([good], [data / "assets" / "cube.ply"], 0, WIDTH).make(2))
     notices: list[str] = []
     assert usable_rows(bench, ["truth", "other-light", "regression"], False, notices) == [
         "truth", "regression",
@@ -484,11 +472,9 @@ def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -
         usable_rows(bench, ["truth", "other-light"], True, notices)
 
 
-def test_other_scenes_are_seen_by_this_camera(
-    scenes: list[tuple[Place, list[Subject]]],
-) -> None:
+def test_other_scenes_are_seen_by_this_camera(data: Path, scenes: Scenes) -> None:
     """Another place's light keeps its place in the picture: both agree in the camera-yaw frame."""
-    bench = make_bench(scenes)
+    bench = make_bench(data, scenes)
     place = scenes[0][0]
     other = bench.other(place)
     assert other.panorama != place.panorama
@@ -503,10 +489,10 @@ def test_other_scenes_are_seen_by_this_camera(
 
 
 def test_estimated_camera_that_is_right_gives_the_same_light(
-    scenes: list[tuple[Place, list[Subject]]], monkeypatch: pytest.MonkeyPatch
+    data: Path, scenes: Scenes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the true camera only the azimuth is used; another pitch gives another light."""
-    bench = make_bench(scenes)
+    bench = make_bench(data, scenes)
     place = scenes[0][0]
     known, estimated = ROWS["regression"].of_place, ROWS["regression-estimated-camera"].of_place
     assert known is not None and estimated is not None

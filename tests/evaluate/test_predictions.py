@@ -1,7 +1,7 @@
 """Crops out, maps back: each map stands where its file says, and faults are one line each."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,37 +19,24 @@ from warpir.evaluate.predictions import (
     read_predictions,
     to_world,
 )
+from warpir.evaluate.scenes import Place, crop_camera
 from warpir.io.cameras.reader import read_camera
 from warpir.io.results import OutputFolder
-from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.placement import turn
-
-
-@dataclass(frozen=True)
-class Crop:
-    """A scene as the benchmark gives it."""
-
-    name: str
-    camera: Camera
-    photo: np.ndarray
-    panorama: str = "somewhere/yard_1k.hdr"
-    exposure: float = 0.25
+from warpir.scene.camera import Camera
 
 
 def view(azimuth: float = 90.0, pitch: float = 0.0, width: int = 96, height: int = 64) -> Camera:
     """Return a camera of 60 degrees vertical field of view that looks at an azimuth."""
-    level = camera_from_fov(width, height, 60.0, pitch, 1.6)
-    focal = height / (2.0 * np.tan(np.radians(30.0)))
-    c2w = level.c2w.copy()
-    c2w[:3, :3] = turn(np.array([0.0, 1.0, 0.0]), -np.radians(azimuth)) @ c2w[:3, :3]
-    return replace(level, c2w=c2w, fx=focal, fy=focal)
+    across = 2.0 * np.degrees(np.arctan(np.tan(np.radians(30.0)) * width / height))
+    return crop_camera(width, height, float(across), azimuth, pitch, 1.6)
 
 
-def scene(name: str = "yard", azimuth: float = 90.0, pitch: float = 0.0) -> Crop:
+def scene(name: str = "yard", azimuth: float = 90.0, pitch: float = 0.0) -> Place:
     camera = view(azimuth, pitch)
     ramp = np.linspace(0.0, 1.0, camera.width, dtype=np.float32)
     photo = np.broadcast_to(ramp[None, :, None], (camera.height, camera.width, 3))
-    return Crop(name, camera, photo)
+    light = np.ones((8, 16, 3), np.float32)
+    return Place(name, "yard_1k", camera, azimuth, pitch, photo, 0.25, "gamma", light, (0,))
 
 
 def dot_map(u: float, v: float, height: int = 64) -> np.ndarray:
@@ -89,7 +76,7 @@ def test_exported_crops_hold_photo_camera_and_light_unit(tmp_path: Path) -> None
     for entry, crop in zip(index["crops"], crops, strict=True):
         codes = np.asarray(Image.open(tmp_path / "crops" / entry["photo"]))
         assert np.abs(codes / 255.0 - crop.photo).max() <= 0.5 / 255.0 + 1e-6
-        assert entry["panorama"] == "yard_1k.hdr"
+        assert entry["panorama"] == "yard_1k"
         assert entry["exposure"] == 0.25
         camera_file = tmp_path / "camera.json"
         camera_file.write_text(json.dumps(entry["camera"]))
@@ -180,8 +167,6 @@ def test_level_frame_ignores_the_pitch_and_keeps_every_texel() -> None:
     pitched = to_world(texels, view(45.0, -30.0), "level")
     assert np.array_equal(flat, pitched)
     assert np.array_equal(np.sort(flat, axis=1), np.sort(texels, axis=1))
-    with pytest.raises(ValueError, match="sideways"):
-        to_world(texels, view(), "sideways")
 
 
 @pytest.mark.parametrize(
@@ -230,19 +215,18 @@ def test_missing_and_unused_maps_are_listed(tmp_path: Path) -> None:
     assert list(found.maps) == ["yard"]
     assert found.missing == ("yard_2",)
     assert found.unused == ("yrad_2.npy",)
-    assert found.frame == "camera"
 
 
 def test_options_of_the_folder_hold_for_its_maps(tmp_path: Path) -> None:
     write_map(tmp_path, "yard", dot_map(0.5, 0.3))
     crop = scene("yard", 20.0, -30.0)
     (tmp_path / INDEX).write_text(json.dumps({"maps": {"frame": "level", "scale": 3.0}}))
-    found = read_predictions(tmp_path, [crop])
-    assert found.frame == "level"
-    assert np.allclose(found.maps["yard"], 3.0 * to_world(dot_map(0.5, 0.3), crop.camera, "level"))
+    found = read_predictions(tmp_path, [crop]).maps["yard"]
+    assert np.allclose(found, 3.0 * to_world(dot_map(0.5, 0.3), crop.camera, "level"))
     export_crops([crop], tmp_path / "crops")
     (tmp_path / INDEX).write_bytes((tmp_path / "crops" / INDEX).read_bytes())
-    assert read_predictions(tmp_path, [crop]).frame == "camera"
+    found = read_predictions(tmp_path, [crop]).maps["yard"]
+    assert np.allclose(found, to_world(dot_map(0.5, 0.3), crop.camera, "camera"))
 
 
 @pytest.mark.parametrize(

@@ -354,7 +354,7 @@ def _missing_measures(lpips: "Distance | None") -> list[str]:
 
 def _exchange(
     options: argparse.Namespace, places: "list[Place]", notices: list[str]
-) -> "dict[str, FloatArray] | None":
+) -> "dict[str, FloatArray]":
     """Write crops for, and read maps of, another system."""
     from warpir.evaluate.predictions import export_crops, read_predictions
 
@@ -362,7 +362,7 @@ def _exchange(
         export_crops(places, options.export_crops, options.overwrite)
         say(f"written: {len(places)} crops in {options.export_crops}")
     if options.predictions is None:
-        return None
+        return {}
     predictions = read_predictions(options.predictions, places)
     if predictions.missing:
         notices.append(f"{len(predictions.missing)} scenes have no map in {options.predictions}")
@@ -374,18 +374,10 @@ def _make_bench(
     options: argparse.Namespace,
     scenes: "list[tuple[Place, list[Subject]]]",
     device: str,
-    predictions: "dict[str, FloatArray] | None",
+    predictions: "dict[str, FloatArray]",
 ) -> "Bench":
     from warpir.evaluate.stage import Bench
-    from warpir.lighting.regressor import load_regressor
 
-    network, missing = None, None
-    try:
-        network = load_regressor(options.regressor)
-    except InputError as error:
-        if options.regressor is not None:
-            raise
-        missing = error
     config = InsertConfig(
         model=options.model,
         regressor=None if options.regressor is None else str(options.regressor),
@@ -395,9 +387,10 @@ def _make_bench(
         # The truth is the paper's: its ratio, without light that the object throws on the ground.
         bounce=False,
     )
-    return Bench(
-        scenes, device, options.seed, config, network, missing, predictions, options.calibrator
-    )
+    bench = Bench(scenes, device, options.seed, config, predictions, options.calibrator)
+    if options.regressor is not None:
+        _ = bench.network  # what was named must be usable, whatever the rows need
+    return bench
 
 
 def usable_rows(

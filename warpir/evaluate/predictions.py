@@ -12,7 +12,7 @@ is up. For a camera that looks up or down, ``maps.frame`` in ``crops.json`` defi
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.lib.format import open_memmap
@@ -24,7 +24,8 @@ from warpir.core.errors import InputError, raise_all
 from warpir.core.latlong import latitudes, map_directions, rotate_map
 from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
-from warpir.evaluate.three_spheres import from_camera_frame, lookup_matrix
+from warpir.evaluate.scenes import Place
+from warpir.evaluate.three_spheres import lookup_matrix
 from warpir.io.images.kinds import check_regular_file
 from warpir.io.images.photos import read_envmap
 from warpir.io.results import OutputFolder
@@ -56,30 +57,6 @@ LEVEL_TOLERANCE = 1e-9
 """A camera whose up axis differs less from +Y is level: its maps are turned without resampling."""
 
 
-class SceneCrop(Protocol):
-    """A scene as `export_crops` and `read_predictions` use it."""
-
-    @property
-    def name(self) -> str:
-        """Letters, digits, ``_``, ``-`` and ``.`` only; each scene has another one."""
-
-    @property
-    def panorama(self) -> str | Path:
-        """The panorama that the crop was taken from; its file name is written down."""
-
-    @property
-    def camera(self) -> Camera:
-        """Camera of the photo, in the world in which the light is compared."""
-
-    @property
-    def photo(self) -> FloatArray:
-        """The crop, display-encoded (gamma 2.2) in [0, 1], shape [H, W, 3]."""
-
-    @property
-    def exposure(self) -> float:
-        """Linear value of the photo per radiance of the panorama [1]."""
-
-
 @dataclass(frozen=True)
 class Predictions:
     """Maps predicted by another system."""
@@ -90,25 +67,22 @@ class Predictions:
     """Names of scenes without a map."""
     unused: tuple[str, ...]
     """Names of files that match no scene."""
-    frame: str
-    """Alignment of the maps, a key of `FRAMES`."""
 
 
-def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: bool = False) -> None:
-    """Write ``NAME.png`` for each scene, ``NAME.public.png`` where it can be made, and the index.
+def export_crops(places: Sequence[Place], folder: Path, overwrite: bool = False) -> None:
+    """Write ``NAME.png`` for each place, ``NAME.public.png`` where it can be made, and the index.
 
     Raises:
         InputError: The folder holds files, or cannot be written.
     """
     entries: list[dict[str, Any]] = []
     with OutputFolder(folder, overwrite) as output:
-        for scene in scenes:
-            photo = f"{scene.name}.png"
-            output.write_png(photo, codes_of(scene.photo), mark=False)
-            public = public_crop(scene.photo, scene.camera)
+        for place in places:
+            output.write_png(f"{place.name}.png", codes_of(place.photo), mark=False)
+            public = public_crop(place.photo, place.camera)
             if public is not None:
-                output.write_png(f"{scene.name}.public.png", codes_of(public), mark=False)
-            entries.append(_crop_entry(scene, photo, public is not None))
+                output.write_png(f"{place.name}.public.png", codes_of(public), mark=False)
+            entries.append(_crop_entry(place, public is not None))
         output.write_json(
             INDEX,
             {
@@ -136,19 +110,19 @@ def export_crops(scenes: Sequence[SceneCrop], folder: str | Path, overwrite: boo
         )
 
 
-def _crop_entry(scene: SceneCrop, photo: str, has_public: bool) -> dict[str, Any]:
+def _crop_entry(place: Place, has_public: bool) -> dict[str, Any]:
     """Return a crop's entry in the index."""
-    rotation = scene.camera.c2w[:3, :3]
+    rotation = place.camera.c2w[:3, :3]
     azimuth, pitch = angles_from_axis(-rotation[:, 2])
     return {
-        "name": scene.name,
-        "photo": photo,
-        "public_photo": f"{scene.name}.public.png" if has_public else None,
-        "panorama": Path(scene.panorama).name,
+        "name": place.name,
+        "photo": f"{place.name}.png",
+        "public_photo": f"{place.name}.public.png" if has_public else None,
+        "panorama": place.panorama,
         "azimuth_deg": azimuth,
         "pitch_deg": pitch,
-        "exposure": scene.exposure,
-        "camera": scene.camera.record(),
+        "exposure": place.exposure,
+        "camera": place.camera.record(),
         "world_direction_of_a_map_in_the_camera_frame": {
             "image_centre": (-rotation[:, 2]).tolist(),
             "middle_row_three_quarters_to_the_right": rotation[:, 0].tolist(),
@@ -157,19 +131,18 @@ def _crop_entry(scene: SceneCrop, photo: str, has_public: bool) -> dict[str, Any
     }
 
 
-def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predictions:
-    """Read the maps of another system for the scenes and turn them to the world frame.
+def read_predictions(folder: Path, places: Sequence[Place]) -> Predictions:
+    """Read the maps of another system for the places and turn them to the world frame.
 
     Args:
         folder: Holds ``NAME.exr``, ``NAME.hdr`` or ``NAME.npy``, and ``crops.json`` if the maps
             are not as it says by default.
-        scenes: The scenes that were exported, at least one.
+        places: Those that were exported, at least one.
 
     Raises:
         InputError: No folder, no map for any scene, two for one, or one that is not clean 2:1
             radiance; all problems at once.
     """
-    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "not a folder (expected a folder of environment maps)")
     frame, scale = _options(folder)
@@ -179,15 +152,15 @@ def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predict
             paths_by_name.setdefault(path.stem, []).append(path)
     maps: dict[str, FloatArray] = {}
     problems: list[InputError] = []
-    for scene in scenes:
-        paths = paths_by_name.pop(scene.name, [])
+    for place in places:
+        paths = paths_by_name.pop(place.name, [])
         try:
             if len(paths) > 1:
                 names = " and ".join(path.name for path in paths)
                 raise InputError(paths[0], f"more than one map of a scene (found {names})")
             if paths:
                 texels = _read_map(paths[0]) * np.float32(scale)
-                maps[scene.name] = to_world(texels, scene.camera, frame)
+                maps[place.name] = to_world(texels, place.camera, frame)
         except InputError as problem:
             problems.append(problem)
     raise_all(problems)
@@ -196,11 +169,11 @@ def read_predictions(folder: str | Path, scenes: Sequence[SceneCrop]) -> Predict
         raise InputError(
             folder,
             f"no map for any scene (found {unused[0] if unused else 'no map'}; expected "
-            f"{scenes[0].name}.exr, .hdr or .npy)",
+            f"{places[0].name}.exr, .hdr or .npy)",
             "name the maps as the exported crops",
         )
-    missing = tuple(scene.name for scene in scenes if scene.name not in maps)
-    return Predictions(maps, missing, unused, frame)
+    missing = tuple(place.name for place in places if place.name not in maps)
+    return Predictions(maps, missing, unused)
 
 
 def to_world(texels: FloatArray, camera: Camera, frame: str) -> FloatArray:
@@ -216,15 +189,13 @@ def to_world(texels: FloatArray, camera: Camera, frame: str) -> FloatArray:
         resampled with 2 x 2 look-ups per texel, which keeps the flux of a single one to 2 %
         (to 10 % in the row at a pole).
     """
-    if frame not in FRAMES:
-        raise ValueError(f"frame {frame!r} is not one of {', '.join(FRAMES)}")
     # Ours has -Z at its left and right edge, not in the centre.
     seen = rotate_map(texels, 180.0)
     rotation = camera.c2w[:3, :3]
     is_level = float(np.abs(rotation[:, 1] - (0.0, 1.0, 0.0)).max()) < LEVEL_TOLERANCE
     if frame == "level" or is_level:
         azimuth, _ = angles_from_axis(-rotation[:, 2])
-        return from_camera_frame(seen, azimuth)
+        return rotate_map(seen, -azimuth)
     height = len(texels)
     # Toward the poles texels get narrower than the look-ups' spacing: average them to it first.
     wide = seen.astype(np.float64)

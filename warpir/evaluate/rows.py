@@ -302,10 +302,7 @@ def _words(stem: str) -> str:
 
 
 def _ablation(words: str, **changes: Any) -> Row:
-    def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-        settings = {"start": "uniform", "accept": False, **changes}
-        return recover_light(bench, subject, subject.place.photo, settings)
-
+    predict = guided(start="uniform", accept=False, **changes)
     return Row("ablations", words, of_subject=predict, start="uniform", needs=("model",))
 
 

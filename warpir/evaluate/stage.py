@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,9 @@ from warpir.calibration.network import Calibrator, load_calibrator
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import ExitCode, InputError
+from warpir.diffusion.models.weight_files import SHIPPED
 from warpir.evaluate.scenes import RESPONSES, Place, Subject
-from warpir.lighting.regressor import Regressor
+from warpir.lighting.regressor import Regressor, load_regressor
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -229,47 +229,32 @@ def _encoded(linear: FloatArray) -> FloatArray:
     return np.minimum(linear_to_gamma(linear), 1.0).astype(np.float32)
 
 
+@dataclass(frozen=True, eq=False)
 class Bench:
-    """Scenes, models and settings that the rows use.
+    """Scenes, models and settings that the rows use."""
 
-    Args:
-        scenes: All places and their subjects.
-        device: Warp device; torch uses the same.
-        seed: Seed of guided runs and of random weights.
-        config: Base configuration of guided runs, without files: model, steps, precision.
-        network: The regressor, or None.
-        missing: Why there is no regressor.
-        predictions: Lights of another system by the place's name, world frame.
-        calibrator_file: Weights of the network that estimates cameras; None: warpir's own.
-    """
+    scenes: list[tuple[Place, list[Subject]]]
+    """All places and their subjects."""
+    device: str
+    """Warp device; torch uses the same."""
+    seed: int
+    """Seed of guided runs and of random weights."""
+    config: InsertConfig
+    """Base configuration of guided runs: model, regressor, steps, precision."""
+    predictions: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Lights of another system by the place's name, world frame."""
+    calibrator_file: Path | None = None
+    """Weights of the network that estimates cameras; None: warpir's own."""
 
-    def __init__(
-        self,
-        scenes: list[tuple[Place, list[Subject]]],
-        device: str,
-        seed: int,
-        config: InsertConfig,
-        network: Regressor | None = None,
-        missing: InputError | None = None,
-        predictions: Mapping[str, FloatArray] | None = None,
-        calibrator_file: Path | None = None,
-    ) -> None:
-        self.scenes, self.device, self.seed, self.config = scenes, device, seed, config
-        self._network, self._missing = network, missing
-        self.predictions = predictions or {}
-        self._calibrator_file = calibrator_file
-
-    @property
+    @cached_property
     def network(self) -> Regressor:
         """The regressor.
 
         Raises:
-            InputError: There is none (`ExitCode.MODEL`).
+            InputError: Its file cannot be used (`ExitCode.MODEL`).
         """
-        if self._network is None:
-            assert self._missing is not None
-            raise self._missing
-        return self._network
+        path = self.config.light.regressor
+        return load_regressor(None if path is None else Path(path))
 
     @cache  # noqa: B019, a bench lives as long as the program
     def network_for(self, panorama: str) -> Regressor:
@@ -293,11 +278,10 @@ class Bench:
 
     def digests(self) -> dict[str, str | None]:
         """Return the sha256 of the weights that were used, by what they are."""
-        where = files("warpir.diffusion") / "weights"
+        given = {"regressor": self.config.light.regressor, "calibrator": self.calibrator_file}
         digests: dict[str, str | None] = {}
-        for name in ("regressor", "calibrator"):
-            given = self._calibrator_file if name == "calibrator" else self.config.flat()[name]
-            path = Path(given or str(where / f"{name}.safetensors"))
+        for name, file in given.items():
+            path = Path(file or SHIPPED / f"{name}.safetensors")
             is_there = path.is_file()
             digests[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_there else None
         return digests
@@ -309,7 +293,7 @@ class Bench:
         Raises:
             InputError: Its file cannot be used (`ExitCode.MODEL`).
         """
-        return load_calibrator(self._calibrator_file)
+        return load_calibrator(self.calibrator_file)
 
     @cached_property
     def random_network(self) -> Regressor:

@@ -32,7 +32,7 @@ from scipy.sparse import csr_array
 
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
-from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles, uv_of
+from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
 from warpir.evaluate.light_errors import HEIGHT, checked_maps, sun_sky_ratio_error
 
 CAMERA = np.array([16.0, 2.0, 0.0])
@@ -84,16 +84,6 @@ MATERIALS = {
     "matte": Material(0.8, 1.0, 0.3271),
     "mirror": Material(0.8, 1.0, 0.0),
 }
-
-
-def from_camera_frame(texels: FloatArray, azimuth_deg: float) -> FloatArray:
-    """Turn a map from the camera-yaw frame into the world frame; exact for whole columns.
-
-    Args:
-        texels: Radiance, lat-long, shape [He, 2 He, 3].
-        azimuth_deg: Azimuth of the camera, clockwise from -Z seen from above [deg].
-    """
-    return rotate_map(texels, -azimuth_deg)
 
 
 def sphere_errors(predicted: FloatArray, true: FloatArray) -> dict[str, float]:

@@ -57,12 +57,12 @@ def corrected_to_upright(cameras: DrawnCameras, draw: Sampler) -> DrawnCameras:
     return replace(cameras, pitch=level, roll=level, y=0.5 + sign * draw.uniform(*SHIFTS))
 
 
-def truth_of(cameras: DrawnCameras, row: int) -> dict[str, float]:
-    """Return pitch, roll and vertical field of view [deg] of one of the cameras."""
+def truth_of(camera: DrawnCameras) -> dict[str, float]:
+    """Return pitch, roll and vertical field of view [deg] of one camera."""
     return {
-        "pitch_deg": math.degrees(float(cameras.pitch[row])),
-        "roll_deg": math.degrees(float(cameras.roll[row])),
-        "vfov_deg": math.degrees(2.0 * math.atan(0.5 / float(cameras.focal[row]))),
+        "pitch_deg": math.degrees(float(camera.pitch)),
+        "roll_deg": math.degrees(float(camera.roll)),
+        "vfov_deg": math.degrees(2.0 * math.atan(0.5 / float(camera.focal))),
     }
 
 
@@ -139,7 +139,7 @@ def measure_cameras(
     generator = torch.Generator().manual_seed(seed)
     drawn = even_cameras(Sampler(scenes, generator))
     other = torch.Generator().manual_seed(seed + 1)  # its photographs leave the others as they are
-    upright = _Upright()
+    corrected: list[tuple[float, ...]] = []
     errors: dict[str, Errors] = {"estimated": {}, "network": {}, "constant": {}}
     covered = Errors()
     seconds, by_lines, used = [], 0, set[str]()
@@ -155,44 +155,29 @@ def measure_cameras(
         estimate = decided(with_lines(alone, photo))
         seconds.append(time.perf_counter() - began)
         by_lines += LINES in estimate.witnesses
-        truth = truth_of(one, 0)
+        truth = truth_of(one)
         _add(errors["estimated"], truth, vars(estimate))
         _add(errors["network"], truth, vars(alone))
         _add(errors["constant"], truth, constant_camera(columns / height))
         _add_covered(covered, truth, estimate)
         level = corrected_to_upright(one, Sampler(1, other))
         seen = network_estimate(photograph(panorama, level, width, other), network)
-        upright.add(estimate, decided(seen), float(level.y[0]))
+        upright, axis = decided(seen), float(level.y[0])
+        recognised, mistaken = upright.is_upright_corrected, estimate.is_upright_corrected
+        corrected.append((recognised, mistaken, abs(upright.principal[1] - axis), abs(0.5 - axis)))
     summary: dict[str, Any] = {row: _summary(parts) for row, parts in errors.items()}
     for name, inside in covered.items():
         summary["estimated"][name]["within_sigma"] = float(np.mean(inside))
     summary["estimated"]["seconds"] = float(np.median(seconds))
     summary["estimated"]["with_lines"] = by_lines / scenes
-    summary |= {"corrected": upright.summary(), "panoramas": sorted(used), "notices": notices}
-    return summary
-
-
-class _Upright:
-    """What is recognised of photographs that are corrected to upright."""
-
-    def __init__(self) -> None:
-        self.recognised: list[bool] = []
-        self.mistaken: list[bool] = []
-        self.axis: list[float] = []
-        self.axis_constant: list[float] = []
-
-    def add(self, plain: CameraEstimate, corrected: CameraEstimate, row: float) -> None:
-        """Add the estimates of one photograph of either kind, and the second's true axis."""
-        self.mistaken.append(plain.is_upright_corrected)
-        self.recognised.append(corrected.is_upright_corrected)
-        self.axis.append(abs(corrected.principal[1] - row))
-        self.axis_constant.append(abs(0.5 - row))
-
-    def summary(self) -> dict[str, float]:
-        """Return shares and median errors."""
-        shares = {k: float(np.mean(getattr(self, k))) for k in ("recognised", "mistaken")}
-        medians = {k: float(np.median(getattr(self, k))) for k in ("axis", "axis_constant")}
-        return shares | medians
+    shares, medians = np.mean(corrected, axis=0), np.median(corrected, axis=0)
+    summary["corrected"] = {
+        "recognised": float(shares[0]),
+        "mistaken": float(shares[1]),
+        "axis": float(medians[2]),
+        "axis_constant": float(medians[3]),
+    }
+    return summary | {"panoramas": sorted(used), "notices": notices}
 
 
 def _shuffled(
