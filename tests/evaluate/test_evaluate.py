@@ -14,7 +14,7 @@ from warpir.app.config import InsertConfig
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
-from warpir.evaluate.command import main, usable_rows
+from warpir.evaluate.command import main
 from warpir.evaluate.judge import light_figures
 from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.report import (
@@ -26,7 +26,7 @@ from warpir.evaluate.report import (
     mean_of,
     summarize,
 )
-from warpir.evaluate.rows import ROWS, chosen_rows
+from warpir.evaluate.rows import ROWS, chosen_rows, usable_rows
 from warpir.evaluate.scenes import (
     HEIGHT_SHARE,
     RESPONSES,

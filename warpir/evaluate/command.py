@@ -13,7 +13,6 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -192,23 +191,25 @@ def _evaluate_cameras(options: argparse.Namespace) -> None:
             "width": options.width,
             "notices": notices,
         }
-        write_file(options.json, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
-        say(f"written: {options.json}")
+        _write_json(options.json, record)
+
+
+def _write_json(path: Path, record: dict[str, Any]) -> None:
+    write_file(path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+    say(f"written: {path}")
 
 
 def evaluate(
     options: argparse.Namespace, rows: Sequence[str], output: "OutputFolder | None"
-) -> dict[str, Any]:
+) -> None:
     """Make the scenes, evaluate every row, print and write the results.
 
     Rows are names in `warpir.evaluate.rows.ROWS`, ``output`` is for tables and contact sheet.
-
-    Returns:
-        What the JSON file holds.
     """
     started = time.perf_counter()
     from warpir.evaluate.judge import Judge, procedural_errors
-    from warpir.evaluate.results import run_record
+    from warpir.evaluate.results import contact_sheet, plain_values, run_record, summarize
+    from warpir.evaluate.rows import usable_rows
     from warpir.render.device import choose_device
     from warpir.train.networks.regressor import read_regressor
 
@@ -238,11 +239,15 @@ def evaluate(
         network = read_regressor(options.regressor, device)
         record["procedural"] = procedural_errors(network, options.procedural, options.seed)
     record["seconds"] = round(time.perf_counter() - started, 1)
-    lines = _summarize(record, entries, rows)
+    lines = summarize(record, entries, rows)
     for line in lines:
         say(line)
-    _write(options, record, lines, panels, sheet_row, output)
-    return record
+    if output is not None:
+        output.write_bytes("tables.md", ("\n".join(lines) + "\n").encode())
+        sheet = contact_sheet(panels, sheet_row)
+        output.write_png("contact_sheet.png", sheet, mark=False, description="Evaluation")
+    if options.json is not None:
+        _write_json(options.json, plain_values(record))
 
 
 def _make_scenes(
@@ -262,57 +267,6 @@ def _make_scenes(
     scenes = places.make(options.scenes)
     notices += places.notices
     return scenes
-
-
-def _summarize(record: dict[str, Any], entries: "list[Entry]", rows: Sequence[str]) -> list[str]:
-    """Add the entries and their summary to the record, and return the tables as lines."""
-    from warpir.evaluate.report import (
-        as_plain,
-        by_kind,
-        compare,
-        kind_table,
-        pair_table,
-        summarize,
-        tables,
-    )
-    from warpir.evaluate.results import head_lines, verdict_lines
-    from warpir.evaluate.rows import ROWS
-
-    starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
-    summary, pairs = summarize(entries), compare(entries, starts)
-    record["kinds"] = by_kind(entries)
-    lines = [
-        *head_lines(record),
-        *verdict_lines(entries),
-        *kind_table(record["kinds"]),
-        *tables(summary, {name: ROWS[name].words for name in rows}),
-        # What is known of the truth needs no comparison; the JSON file has it all the same.
-        *pair_table([p for p in pairs if ROWS[p.row].group != "references"]),
-    ]
-    record["entries"] = [asdict(entry) for entry in entries]
-    record["summary"] = as_plain(summary)
-    record["pairs"] = [asdict(pair) for pair in pairs]
-    return lines
-
-
-def _write(
-    options: argparse.Namespace,
-    record: dict[str, Any],
-    lines: list[str],
-    panels: "list[Panel]",
-    sheet_row: str,
-    output: "OutputFolder | None",
-) -> None:
-    from warpir.evaluate.results import contact_sheet, plain_values
-
-    if output is not None:
-        output.write_bytes("tables.md", ("\n".join(lines) + "\n").encode())
-        sheet = contact_sheet(panels, sheet_row)
-        output.write_png("contact_sheet.png", sheet, mark=False, description="Evaluation")
-    if options.json is not None:
-        text = json.dumps(plain_values(record), indent=1, allow_nan=False) + "\n"
-        write_file(options.json, text.encode())
-        say(f"written: {options.json}")
 
 
 def _kinds(path: Path | None) -> dict[str, str]:
@@ -391,26 +345,3 @@ def _make_bench(
     if options.regressor is not None:
         _ = bench.network  # what was named must be usable, whatever the rows need
     return bench
-
-
-def usable_rows(
-    bench: "Bench", rows: Sequence[str], is_asked: bool, notices: list[str]
-) -> list[str]:
-    """Return the usable rows; an unusable one is an error only if it was named.
-
-    Raises:
-        InputError: A row that was asked for needs what is not there.
-    """
-    from warpir.evaluate.rows import ROWS
-
-    usable = []
-    for name in rows:
-        try:
-            ROWS[name].require(bench)
-        except InputError as error:
-            if is_asked:
-                raise
-            notices.append(f"row {name} is left out: {error.where}: {error.what}")
-        else:
-            usable.append(name)
-    return usable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,39 +34,32 @@ PROCEDURAL_BATCH = 64
 """Number of photographs rendered at once."""
 
 
+@dataclass(frozen=True)
 class Judge:
-    """Computes the errors of the rows, place by place.
+    """Computes the errors of the rows, place by place."""
 
-    Args:
-        bench: Scenes and models of the rows.
-        rows: Names of the rows.
-        samples: Camera samples per pixel.
-        threads: Threads on the CPU; 0 for one per core.
-        lpips: The perceptual distance, or None.
-        sheet_row: Row on the contact sheet.
-        kinds: Kind of place by the panorama's name.
-    """
-
-    def __init__(
-        self,
-        bench: Bench,
-        rows: Sequence[str],
-        samples: int,
-        threads: int,
-        lpips: Distance | None,
-        sheet_row: str,
-        kinds: Mapping[str, str] | None = None,
-    ) -> None:
-        self.kinds = kinds or {}
-        self.bench, self.rows, self.lpips, self.sheet_row = bench, rows, lpips, sheet_row
-        self.quality, self.threads = Quality(samples, 2, 5, bench.seed, 8.0), threads
+    bench: Bench
+    """Scenes and models of the rows."""
+    rows: Sequence[str]
+    """Names of the rows."""
+    samples: int
+    """Camera samples per pixel."""
+    threads: int
+    """Threads on the CPU; 0 for one per core."""
+    lpips: Distance | None
+    """The perceptual distance."""
+    sheet_row: str
+    """Row on the contact sheet."""
+    kinds: Mapping[str, str]
+    """Kind of place by the panorama's name."""
 
     def place(self, place: Place, subjects: list[Subject]) -> tuple[list[Entry], list[Panel]]:
         """Return the errors of every row in one place, and its panels of the contact sheet."""
+        quality = Quality(self.samples, 2, 5, self.bench.seed, 8.0)
         entries, panels = [], []
         of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
         for subject in subjects:
-            stage = Stage(subject, self.bench.device, self.quality, self.threads)
+            stage = Stage(subject, self.bench.device, quality, self.threads)
             regions = make_regions(stage.mask, stage.ratio)
             lights: dict[str, FloatArray] = {}
             for name in self.rows:

@@ -6,7 +6,7 @@ import argparse
 import subprocess
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ from PIL import Image, ImageDraw
 import warpir
 from warpir.app.record import versions
 from warpir.core.arrays import CodeArray
+from warpir.evaluate import report
 from warpir.evaluate.report import Entry
+from warpir.evaluate.rows import ROWS
 from warpir.evaluate.scenes import Place, Subject
 from warpir.evaluate.stage import Bench
 
@@ -140,6 +142,25 @@ def head_lines(record: dict[str, Any]) -> list[str]:
             for name, s in record["procedural"].items()
         ]
         lines.append("")
+    return lines
+
+
+def summarize(record: dict[str, Any], entries: list[Entry], rows: Sequence[str]) -> list[str]:
+    """Add the entries and their summary to the record, and return the tables as lines."""
+    starts = {name: row.start for name, row in ROWS.items() if row.start is not None}
+    summary, pairs = report.summarize(entries), report.compare(entries, starts)
+    record["kinds"] = report.by_kind(entries)
+    lines = [
+        *head_lines(record),
+        *verdict_lines(entries),
+        *report.kind_table(record["kinds"]),
+        *report.tables(summary, {name: ROWS[name].words for name in rows}),
+        # What is known of the truth needs no comparison; the JSON file has it all the same.
+        *report.pair_table([p for p in pairs if ROWS[p.row].group != "references"]),
+    ]
+    record["entries"] = [asdict(entry) for entry in entries]
+    record["summary"] = report.as_plain(summary)
+    record["pairs"] = [asdict(pair) for pair in pairs]
     return lines
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -442,3 +442,22 @@ def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True)
     else:
         names.discard("predictions")
     return [name for name in ROWS if name in names]
+
+
+def usable_rows(bench: Bench, rows: Sequence[str], is_asked: bool, notices: list[str]) -> list[str]:
+    """Return the usable rows; an unusable one is an error only if it was named.
+
+    Raises:
+        InputError: A row that was asked for needs what is not there.
+    """
+    usable = []
+    for name in rows:
+        try:
+            ROWS[name].require(bench)
+        except InputError as error:
+            if is_asked:
+                raise
+            notices.append(f"row {name} is left out: {error.where}: {error.what}")
+        else:
+            usable.append(name)
+    return usable
