@@ -10,8 +10,7 @@ import torch
 from tests.lighting.test_regressor import SMALL
 from warpir.evaluate.stage import unseen_by
 from warpir.lighting.regressor import Prediction, load_regressor, mixture, split
-from warpir.train.batches import PhotoBatch
-from warpir.train.command import Replay
+from warpir.train.batches import PhotoBatch, Replay
 from warpir.train.networks.regressor import random_regressor, read_regressor, save_regressor
 from warpir.train.places import of_fold, place_of, some_places
 from warpir.train.regressor import join_members

@@ -5,6 +5,7 @@ Files are called by their names alone, since a report is passed on; ``run.json``
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Mapping
@@ -198,17 +199,14 @@ def light_sources(record: Mapping[str, Any], asked: LightConfig) -> Rows:
     """
     measured = record["measured"]
     rows: Rows = [("the light", _source(record, asked))]
-    if "regression" in measured:
-        regression = measured["regression"]
-        rows += [
-            (
-                "how sure the regressor was",
-                f"± {regression['spread_deg']:.0f}° in the direction (concentration "
-                f"{regression['concentration']:.1f}; 0 would be no idea); a factor of "
-                f"{2.718281828 ** regression['sun_log_std']:.1f} either way in the main light's "
-                f"strength, {2.718281828 ** regression['ambient_log_std']:.1f} in the rest's",
-            ),
-        ]
+    if regression := measured.get("regression"):
+        text = (
+            f"± {regression['spread_deg']:.0f}° in the direction (concentration "
+            f"{regression['concentration']:.1f}; 0 would be no idea); a factor of "
+            f"{math.exp(regression['sun_log_std']):.1f} either way in the main light's "
+            f"strength, {math.exp(regression['ambient_log_std']):.1f} in the rest's"
+        )
+        rows.append(("how sure the regressor was", text))
     if ground := measured.get("ground"):
         text = (
             f"{ground['implied_albedo']:.2g} under the light as it was regressed, "
@@ -238,9 +236,12 @@ def summary_line(record: Mapping[str, Any]) -> str:
     if "regression" in measured:
         spread = measured["regression"]["spread_deg"]
         parts.append(f"light regressed from the photo, +- {spread:.0f} degrees")
-    integrators = (measured.get("loop_integrator"), measured["integrator"])
-    rendered = " and ".join(dict.fromkeys(name for name in integrators if name))
-    return f"summary: {'; '.join(parts)}; {rendered} on {record['device']}"
+    return f"summary: {'; '.join(parts)}; {_integrators(measured)} on {record['device']}"
+
+
+def _integrators(measured: Mapping[str, Any]) -> str:
+    names = measured.get("loop_integrator"), measured["integrator"]
+    return " and ".join(dict.fromkeys(name for name in names if name))
 
 
 def _source(record: Mapping[str, Any], asked: LightConfig) -> str:
@@ -308,11 +309,10 @@ def _guided(measured: Mapping[str, Any]) -> Rows:
 def figures(record: Mapping[str, Any]) -> Rows:
     """Return plain figures of the run."""
     measured = record["measured"]
-    rows: Rows = [("device", str(record["device"]))]
-    integrators = [measured.get("loop_integrator"), measured["integrator"]]
-    rows.append(("integrator", " and ".join(dict.fromkeys(i for i in integrators if i))))
-    rows.append(("rays", measured["rays"]))
-    rows += [
+    rows: Rows = [
+        ("device", str(record["device"])),
+        ("integrator", _integrators(measured)),
+        ("rays", measured["rays"]),
         ("triangles", f"{measured['triangles']:,}"),
         ("pixels of the object, as rendered", f"{measured['object_pixels']:,}"),
         ("pixels whose shadow was traced, as rendered", f"{measured['shadow_pixels']:,}"),

@@ -315,12 +315,7 @@ def _inputs(asked: Mapping[str, Any], record: Mapping[str, Any]) -> list[tuple[s
 def _files(results: Results) -> list[tuple[str, str, str, str]]:
     """Return (name, purpose, size, sha256) of each file but the page itself."""
     return [
-        (
-            name,
-            about_file(name),
-            _size(results.sizes[name]) if name in results.sizes else "",
-            digest,
-        )
+        (name, about_file(name), _size(results.sizes.get(name)), digest)
         for name, digest in sorted(results.files.items())
         if name != REPORT
     ]

@@ -18,7 +18,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -246,54 +246,6 @@ def files_in(folders: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(found, key=lambda path: path.stem)
 
 
-def _counted(
-    make: Callable[[int, int], Any],
-) -> Callable[[int, torch.Generator], Any]:
-    """Return a callable that gives new batches: it begins at an index that is drawn once."""
-    index: int | None = None
-
-    def batches(count: int, generator: torch.Generator) -> Any:
-        nonlocal index
-        if index is None:
-            import torch
-
-            drawn = torch.randint(2**30, (), generator=generator, device=generator.device)
-            index = int(drawn)
-        index += 1
-        return make(index, count)
-
-    return batches
-
-
-class Replay:
-    """Batches of photos drawn from the newest ``kept`` ones; each is used so often on average."""
-
-    def __init__(
-        self, batches: Callable[[int, torch.Generator], PhotoBatch], uses: int, kept: int
-    ) -> None:
-        self.batches, self.uses, self.kept = batches, uses, kept
-        self.held: dict[str, torch.Tensor] = {}
-        self.drawn = self.rendered = 0
-
-    def __call__(self, count: int, generator: torch.Generator) -> PhotoBatch:
-        """Return a batch; arguments are those of `SceneGenerator.photo_batch`'s callers."""
-        import torch
-
-        from warpir.train.batches import PhotoBatch
-
-        if self.rendered * self.uses <= self.drawn:
-            slot = self.rendered % self.kept * count
-            for name, part in vars(self.batches(count, generator)).items():
-                shape = (self.kept * count, *part.shape[1:])
-                held = self.held.setdefault(name, part.new_empty(shape))
-                held[slot : slot + count] = part
-            self.rendered += 1
-        self.drawn += 1
-        filled = min(self.rendered, self.kept) * count
-        index = torch.randint(filled, (count,), generator=generator, device=generator.device)
-        return PhotoBatch(**{name: held[index] for name, held in self.held.items()})
-
-
 def _train_on(
     pools: tuple[LightPool, LightPool],
     options: argparse.Namespace,
@@ -302,6 +254,7 @@ def _train_on(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     """Train on the first panoramas, validate on the second ones; return how it ended."""
+    from warpir.train.batches import Replay
     from warpir.train.networks.regressor import read_regressor
     from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
@@ -327,7 +280,7 @@ def _train_on(
     if start is not None:
         record = record | {"started_from": start.record}
     end = train_regressor(
-        Replay(_counted(scenes.photo_batch), REPLAYS, REPLAYED),
+        Replay(scenes.next_batch, REPLAYS, REPLAYED),
         validation,
         options.out,
         settings,

@@ -60,6 +60,7 @@ class SceneGenerator:
         self.panoramas, self.seed, self.mixture = panoramas, seed, mixture or Mixture()
         self.device = panoramas.fine.device
         self._pool: tuple[int, LightPool] | None = None
+        self._newest: int | None = None
 
     def _generator(self, *key: int) -> torch.Generator:
         generator = torch.Generator(device=self.device)
@@ -74,6 +75,14 @@ class SceneGenerator:
             self._pool = epoch, pool
             self._share = pool.flux_share()
         return self._pool[1]
+
+    def next_batch(self, count: int, generator: torch.Generator) -> PhotoBatch:
+        """Return new photos; the generator draws once at which batch they begin."""
+        if self._newest is None:
+            drawn = torch.randint(2**30, (), generator=generator, device=generator.device)
+            self._newest = int(drawn)
+        self._newest += 1
+        return self.photo_batch(self._newest, count)
 
     def photo_batch(self, index: int, count: int) -> PhotoBatch:
         """Return photos and their light."""
