@@ -7,12 +7,7 @@ from warpir.scene.camera import CameraEstimate
 
 
 def estimate_photo(photo: FloatArray, vfov_deg: float | None) -> CameraEstimate:
-    """Estimate the camera of a photo; see `warpir.calibration.estimate.estimate_camera`.
-
-    Args:
-        photo: Display-encoded (sRGB) in [0, 1], shape [H, W, 3].
-        vfov_deg: Vertical field of view where it is known [deg].
-    """
+    """Estimate the camera of a photo: `warpir.calibration.estimate.estimate_camera`."""
     from warpir.calibration.estimate import estimate_camera
 
     return estimate_camera(photo, vfov_deg=vfov_deg)

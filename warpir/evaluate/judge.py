@@ -115,12 +115,7 @@ def _judge_light(
 
 
 def light_figures(place: Place, texels: FloatArray) -> dict[str, float]:
-    """Return the errors of a light, ``light.*`` and ``spheres.*``, in the camera-yaw frame.
-
-    Args:
-        place: The place, with the true light.
-        texels: Lat-long radiance, world frame, shape [He, 2 He, 3].
-    """
+    """Return the errors of a lat-long light, world frame: ``light.*`` and ``spheres.*``."""
     predicted, true = place.to_camera(texels), place.to_camera(place.texels)
     errors = light_errors(predicted, true)
     for name in [n for n in errors if n.startswith("log_")]:

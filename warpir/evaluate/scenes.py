@@ -90,12 +90,7 @@ def crop_camera(
 
 
 def turned_to(camera: Camera, azimuth: float) -> Camera:
-    """Return a camera that looks toward -Z, turned to an azimuth.
-
-    Args:
-        camera: Above the origin.
-        azimuth: Clockwise from -Z seen from above [deg].
-    """
+    """Return a camera that looks toward -Z, turned clockwise as seen from above [deg]."""
     c2w = camera.c2w.copy()
     c2w[:3, :3] = turn(np.array([0.0, 1.0, 0.0]), -np.radians(azimuth)) @ c2w[:3, :3]
     return replace(camera, c2w=c2w)

@@ -389,11 +389,7 @@ def _bands(
 
 
 def _peak(gain: Float64Array) -> tuple[float, float]:
-    """Return the roughness of most gain between those tried, and its jackknife deviation.
-
-    Args:
-        gain: Of each roughness and sector, shape [roughness, sector].
-    """
+    """Return the roughness of most gain [roughness, sector], and its jackknife deviation."""
 
     def peak(of: Float64Array) -> float:
         k = int(np.clip(of.argmax(), 1, len(ROUGHNESSES) - 2))

@@ -14,12 +14,7 @@ from warpir.train.stepping import TrainingSettings
 
 
 def mirror(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
-    """Mirror the chosen photos, and with them everything that has a left and a right.
-
-    Args:
-        batch: Photos and light.
-        chosen: Which, bool, shape [B].
-    """
+    """Mirror the chosen photos [B], and with them everything that has a left and a right."""
     sign = batch.axis.new_tensor([-1.0, 1.0, 1.0])
 
     def turned(plain: Tensor, reflected: Tensor) -> Tensor:
@@ -59,12 +54,7 @@ def stretch(batch: PhotoBatch, chosen: Tensor, generator: torch.Generator) -> Ph
 
 
 def discolour(batch: PhotoBatch, chosen: Tensor) -> PhotoBatch:
-    """Take the colour out of the chosen photos and of their light.
-
-    Args:
-        batch: Photos and light.
-        chosen: Which, bool, shape [B].
-    """
+    """Take the colour out of the chosen photos [B] and of their light."""
     weights = batch.photo.new_tensor(LUMINANCE_WEIGHTS)
     grey = torch.einsum("bchw,c->bhw", batch.photo.clamp(min=0.0) ** GAMMA, weights)
     grey = grey.clamp(min=0.0)[:, None].expand_as(batch.photo) ** (1.0 / GAMMA)

@@ -136,11 +136,7 @@ def gaussian(error: Tensor, log_var: Tensor) -> Tensor:
 
 
 class MeanLight:
-    """Running mean of the training light, as one constant prediction.
-
-    Args:
-        loss: Of the network.
-    """
+    """Running mean of the training light, as one constant prediction."""
 
     def __init__(self, loss: LightLoss) -> None:
         self.loss = loss

@@ -48,12 +48,7 @@ class Look:
 
 
 def draw_looks(radiance: Tensor, generator: torch.Generator) -> Look:
-    """Draw cameras that expose some photos about right.
-
-    Args:
-        radiance: The photos, without the object, shape [B, 3, H, W].
-        generator: Of their device.
-    """
+    """Draw cameras that expose some photos of radiance [B, 3, H, W] about right."""
     draw = Sampler(len(radiance), generator)
     # Of what is not black, as in the benchmark; a kth value is a quantile without its size limit.
     values = radiance.flatten(1)
@@ -77,12 +72,7 @@ def draw_looks(radiance: Tensor, generator: torch.Generator) -> Look:
 
 
 def draw_faults(shown: Tensor, generator: torch.Generator) -> Tensor:
-    """Return photos with vignetting, blur, noise and JPEG's blocks, each in some of them.
-
-    Args:
-        shown: Display values, shape [B, 3, H, W].
-        generator: Of their device.
-    """
+    """Return photos [B, 3, H, W] with vignetting, blur, noise or JPEG's blocks in some of them."""
     count, _, height, width = shown.shape
     device, draw = shown.device, Sampler(count, generator)
 

@@ -85,7 +85,7 @@ def train_regressor(
         batches: Gives that many photos on ``device``, drawn with the generator given.
         validation: Fixed batches by the set's name, such as ``procedural`` and ``panoramas``.
         out: Folder of the weights, the curve and the checkpoints to resume from.
-        settings: How.
+        settings: Of the optimiser, its schedule and the augmentation.
         device: Where the network is trained.
         minutes: Time for this call.
         total_minutes: Time for all calls.
@@ -119,11 +119,7 @@ def train_regressor(
 
 
 def join_members(paths: Sequence[Path], out: Path) -> RegressorModule:
-    """Join networks of one size into one regressor that averages their answers, and write it.
-
-    Args:
-        paths: A file for each, calibrated.
-        out: The file to write; its record holds those of the members.
+    """Join calibrated networks of one size into one that averages their answers, and write it.
 
     Raises:
         InputError: A file cannot be used (`ExitCode.MODEL`).

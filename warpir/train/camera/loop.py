@@ -61,8 +61,8 @@ def train_camera(
             and calibrate the standard deviations. None: the last weights are kept, with the
             calibration of ``start``.
         out: Folder of the results.
-        settings: How.
-        device: Where.
+        settings: Of the optimiser, its schedule and the validation.
+        device: Of the panoramas, the network and its training.
         minutes: Time, on the wall clock.
         seed: Of the weights and the photos.
         start: Network to begin with; default: random weights.

@@ -44,11 +44,7 @@ class Views:
         return torch.stack([-w, -h, 2.0 * w, 2.0 * h], dim=1)
 
     def rays(self, size: tuple[int, int]) -> Tensor:
-        """Return the unit viewing directions of the photo's pixels, world frame, [B, 3, H, W].
-
-        Args:
-            size: Height and width [px].
-        """
+        """Return the unit viewing directions of the photo's pixels, world frame, [B, 3, H, W]."""
         height, width = size
         window, device = self.window, self.origin.device
         across = (torch.arange(width, device=device) + 0.5) / width
@@ -61,13 +57,7 @@ class Views:
 
 
 def turned_about(axis: Tensor, vector: Tensor, angle: Tensor) -> Tensor:
-    """Turn vectors about unit axes that stand at right angles to them, shape [B, 3].
-
-    Args:
-        axis: Shape [B, 3].
-        vector: Shape [B, 3].
-        angle: [rad], shape [B].
-    """
+    """Turn vectors [B, 3] by angles [rad] about unit axes that stand at right angles to them."""
     across: Tensor = torch.linalg.cross(axis, vector)
     return angle.cos()[:, None] * vector + angle.sin()[:, None] * across
 

@@ -47,12 +47,7 @@ class Rendered:
 
 
 def render(scenes: Scenes, size: tuple[int, int]) -> Rendered:
-    """Render each scene's photo.
-
-    Args:
-        scenes: What is rendered.
-        size: Height and width [px].
-    """
+    """Render each scene's photo; the size is height and width [px]."""
     (height, width), count = size, len(scenes.is_panorama)
     tables, x = scenes.tables, scenes.lighting
     pixels, device = count * height * width, scenes.is_panorama.device
