@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 import warpir.demo
-from warpir.calibration.estimate import LINES, decided, estimate_camera, network_estimate
+from tests.builders.estimates import a_camera
+from warpir.calibration.estimate import LINES, decided, estimate_camera
 from warpir.calibration.lines import find_segments, upright_roll
 from warpir.calibration.network import (
     BLUR,
@@ -154,11 +155,7 @@ def test_quantiles_of_an_even_histogram() -> None:
 
 
 def test_camera_without_roll_is_the_camera_of_the_flags() -> None:
-    photo = np.full((40, 60, 3), 0.5, np.float32)
-    estimate = estimate_camera(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=40.0)
-    camera = type(estimate)(
-        **vars(estimate) | {"roll_deg": 0.0, "pitch_deg": -9.0, "principal": (0.5, 0.5)}
-    ).camera(60, 40, 1.6)
+    camera = a_camera(pitch_deg=-9.0, vfov_deg=40.0).camera(60, 40, 1.6)
     hfov = np.degrees(2.0 * np.arctan(1.5 * np.tan(np.radians(20.0))))
     expected = camera_from_fov(60, 40, hfov, -9.0, 1.6)
     assert camera.fx == pytest.approx(expected.fx)
@@ -166,11 +163,7 @@ def test_camera_without_roll_is_the_camera_of_the_flags() -> None:
 
 
 def test_positive_roll_lets_the_horizon_fall_to_the_right() -> None:
-    photo = np.full((40, 60, 3), 0.5, np.float32)
-    estimate = estimate_camera(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=40.0)
-    camera = type(estimate)(
-        **vars(estimate) | {"roll_deg": 10.0, "pitch_deg": 0.0, "principal": (0.5, 0.5)}
-    ).camera(60, 40, 1.6)
+    camera = a_camera(roll_deg=10.0, vfov_deg=40.0).camera(60, 40, 1.6)
     left, right = camera.project(np.array([[-10.0, 1.6, -50.0], [10.0, 1.6, -50.0]]))
     assert right[1] > left[1]
     slope = (right[1] - left[1]) / (right[0] - left[0])
@@ -179,10 +172,7 @@ def test_positive_roll_lets_the_horizon_fall_to_the_right() -> None:
 
 def test_upright_edges_tell_the_roll() -> None:
     """Posts in front of a known camera, found from a first guess that is far off."""
-    photo = np.full((40, 60, 3), 0.5, np.float32)
-    start = estimate_camera(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=50.0)
-    known = {"roll_deg": 6.0, "pitch_deg": -12.0, "principal": (0.5, 0.5)}
-    camera = type(start)(**vars(start) | known).camera(480, 320, 1.6)
+    camera = a_camera(roll_deg=6.0, pitch_deg=-12.0).camera(480, 320, 1.6)
     posts = [(x, z) for x in np.linspace(-4.0, 4.0, 9) for z in (-6.0, -9.0)]
     ends = [camera.project(np.array([[x, 0.2, z], [x, 1.8, z]])).ravel() for x, z in posts]
     rng = np.random.default_rng(0)
@@ -249,9 +239,7 @@ def test_shipped_network_is_unsure_of_a_fisheye_picture() -> None:
 
 
 def test_axis_near_the_middle_is_the_middle_and_the_horizon_stays() -> None:
-    photo = np.full((40, 60, 3), 0.5, np.float32)
-    start = network_estimate(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=50.0)
-    near = replace(start, pitch_deg=-9.0, roll_deg=5.0, principal=(0.47, 0.55))
+    near = a_camera(pitch_deg=-9.0, roll_deg=5.0, principal=(0.47, 0.55))
     centred = decided(near)
     assert centred.principal == (0.5, 0.5) and not centred.is_upright_corrected
     assert centred.pitch_deg > -9.0
@@ -267,9 +255,7 @@ def test_axis_near_the_middle_is_the_middle_and_the_horizon_stays() -> None:
 
 
 def test_axis_far_from_the_middle_is_that_of_a_corrected_photo() -> None:
-    photo = np.full((40, 60, 3), 0.5, np.float32)
-    start = network_estimate(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=50.0)
-    found = decided(replace(start, pitch_deg=0.5, roll_deg=0.0, principal=(0.46, 0.24)))
+    found = decided(a_camera(pitch_deg=0.5, principal=(0.46, 0.24)))
     assert found.principal == (0.5, 0.24) and found.is_upright_corrected
     assert found.pitch_deg == 0.5
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.builders.estimates import write_envmap
 from warpir.evaluate.camera.measure import (
     constant_camera,
     corrected_to_upright,
@@ -16,7 +17,6 @@ from warpir.evaluate.camera.measure import (
     unlearned,
 )
 from warpir.evaluate.command import main
-from warpir.io.results import OutputFolder
 from warpir.scene.camera import camera_from_fov
 from warpir.train.camera.crops import DrawnCameras, read_panoramas
 from warpir.train.networks.calibrator import CalibratorConfig, random_calibrator, save_calibrator
@@ -30,11 +30,7 @@ def panoramas(tmp_path: Path) -> Path:
     """A folder with a panorama, dark ground and bright sky, and with a file that is none."""
     texels = np.full((64, 128, 3), 0.2, np.float32)
     texels[:32] = 1.0
-    with OutputFolder(tmp_path / "field") as output:
-        output.write_envmap(texels, "field")
-    for path in (tmp_path / "field").iterdir():
-        if path.name != "field.exr":
-            path.unlink()
+    write_envmap(tmp_path / "field", "field", texels)
     (tmp_path / "field" / "broken.hdr").write_bytes(b"#?RADIANCE")
     return tmp_path / "field"
 

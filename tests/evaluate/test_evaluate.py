@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from tests.builders.estimates import a_camera, write_envmap
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.core.arrays import FloatArray
@@ -40,9 +41,7 @@ from warpir.evaluate.scenes import (
     mirrored,
 )
 from warpir.evaluate.stage import Bench, Prediction, Stage
-from warpir.io.results import OutputFolder
 from warpir.render.picture.quality import Quality
-from warpir.scene.camera import CameraEstimate
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 from warpir.train.networks.regressor import random_regressor, save_regressor
@@ -73,11 +72,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders ``panoramas`` and ``assets``, and ``regressor.safetensors`` with random weights."""
     folder = tmp_path_factory.mktemp("data")
     for name, sun in SUNS.items():
-        with OutputFolder(folder / "panoramas" / name) as output:
-            output.write_envmap(panorama(*sun), name)
-        for path in (folder / "panoramas" / name).iterdir():
-            if path.name != f"{name}.exr":
-                path.unlink()
+        write_envmap(folder / "panoramas" / name, name, panorama(*sun))
     (folder / "assets").mkdir()
     trimesh.creation.box((1.0, 0.7, 0.5)).export(folder / "assets" / "cube.ply")
     save_regressor(random_regressor(3), folder / "regressor.safetensors", {})
@@ -497,17 +492,7 @@ def test_estimated_camera_that_is_right_gives_the_same_light(
     known, estimated = ROWS["regression"].of_place, ROWS["regression-estimated-camera"].of_place
     assert known is not None and estimated is not None
     vfov = np.degrees(2.0 * np.arctan(place.camera.height / 2.0 / place.camera.fy))
-    found = CameraEstimate(
-        pitch_deg=place.pitch,
-        roll_deg=0.0,
-        vfov_deg=float(vfov),
-        principal=(0.5, 0.5),
-        pitch_sigma_deg=1.0,
-        roll_sigma_deg=1.0,
-        vfov_sigma_deg=1.0,
-        principal_sigma=(0.1, 0.1),
-        witnesses=(),
-    )
+    found = a_camera(pitch_deg=place.pitch, vfov_deg=float(vfov))
     monkeypatch.setattr("warpir.evaluate.rows.estimate_camera", lambda *_: found)
     expected, seen = (as_map(row(bench, place).light, 32) for row in (known, estimated))
     np.testing.assert_allclose(seen, expected, rtol=1e-3, atol=1e-5)

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from tests import oracles
+from tests.builders.estimates import write_envmap
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
 from warpir.core.latlong import map_directions, texel_solid_angles
@@ -50,10 +51,8 @@ def write_map(folder: Path, name: str, texels: np.ndarray, kind: str = "npy") ->
     folder.mkdir(exist_ok=True)
     if kind == "npy":
         np.save(folder / f"{name}.npy", texels)
-        return
-    with OutputFolder(folder / "out", overwrite=True) as output:
-        output.write_envmap(texels, "map")
-    (folder / "out" / f"map.{kind}").rename(folder / f"{name}.{kind}")
+    else:
+        write_envmap(folder, name, texels, kind)
 
 
 def bright_direction(texels: np.ndarray) -> np.ndarray:

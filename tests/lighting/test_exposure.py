@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.builders.shapes import box, camera
+from tests.builders.estimates import a_regression, box_before, even_ambient
+from tests.builders.shapes import camera
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import FloatArray
-from warpir.io.images.photos import Photo
 from warpir.lighting import estimate, exposure
 from warpir.lighting.estimate import estimate_light
 from warpir.lighting.exposure import (
@@ -21,10 +21,7 @@ from warpir.lighting.exposure import (
     expected_change,
 )
 from warpir.lighting.regression import Regression
-from warpir.lighting.regressor import AMBIENT_SHARPNESS, ambient_axes
-from warpir.scene.asset import Asset, Material
-from warpir.scene.light import Lobes, axis_from_angles
-from warpir.scene.placement import place_asset
+from warpir.scene.light import axis_from_angles
 from warpir.scene.shadow_mask import ShadowMask
 
 ELEVATION = 50.0
@@ -34,23 +31,13 @@ SUN = 2.0
 
 def regression(level: float = 1.0, log_std: float = 0.5, ambient: float = 0.0) -> Regression:
     """A white sun of `SUN` times ``level`` [1], and an even ambient light of that radiance."""
-    axis = axis_from_angles(20.0, ELEVATION)
-    axes = ambient_axes()
-    return Regression(
-        axis=axis,
-        spread_deg=10.0,
-        concentration=50.0,
-        directions=axis[None],
-        probability=np.ones(1),
+    return a_regression(
+        axis=axis_from_angles(20.0, ELEVATION),
         sun=np.full(3, SUN * level),
         sun_log_std=log_std,
         sigma=0.005,
         share=0.9,
-        ambient=Lobes(
-            np.full((len(axes), 3), ambient, np.float32),
-            axes.astype(np.float32),
-            np.full(len(axes), AMBIENT_SHARPNESS, np.float32),
-        ),
+        ambient=even_ambient(ambient),
         ambient_log_std=log_std,
     )
 
@@ -62,10 +49,7 @@ def inputs_of(albedo: float | FloatArray) -> Inputs:
     srgb = srgb.astype(np.float32)
     codes = np.round(srgb * 65535.0).astype(np.uint16)
     view = camera(48, 32, 48.0, (0.0, 1.5, 0.0), -15.0)
-    part = box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    asset = Asset("box", (part,), (Material(),))
-    placement = place_asset(*asset.bounds(), view, place=(0.0, 0.0, -5.0))
-    return Inputs(Photo(codes, srgb, "png"), asset, view, placement)
+    return box_before(view, srgb, codes)
 
 
 @pytest.mark.parametrize("level", [0.25, 0.5, 1.0, 2.0, 4.0])

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
+from tests.builders.estimates import a_regression
 from warpir.calibration.forward import softmax
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions
 from warpir.diffusion.models.weight_files import read_header, values_hash
 from warpir.lighting.regression import (
-    Regression,
     camera_rays,
     facing_irradiance,
     mean_training_light,
@@ -231,32 +231,12 @@ def test_frame_of_a_vertical_view_is_its_up_axis(pitch_deg: float) -> None:
 # -------------------------------------------------------------------------------------- units
 
 
-def regression(sigma: float, axis: NDArray[np.float64]) -> Regression:
-    nothing = Lobes(
-        np.zeros((14, 3), np.float32), ambient_axes().astype(np.float32), np.full(14, 4, np.float32)
-    )
-    directions = candidates(300)
-    return Regression(
-        axis=axis,
-        spread_deg=10.0,
-        concentration=20.0,
-        directions=directions,
-        probability=np.full(len(directions), 1.0 / len(directions)),
-        sun=np.array([3.0, 2.5, 1.5]),
-        sun_log_std=0.3,
-        sigma=sigma,
-        share=0.6,
-        ambient=nothing,
-        ambient_log_std=0.2,
-    )
-
-
 @pytest.mark.parametrize("sigma", [0.0023, 0.05, 0.4, 1.0])
 @pytest.mark.parametrize("sigma_min", [0.0, 0.1])
 def test_lobes_give_the_irradiance_stated(sigma: float, sigma_min: float) -> None:
     """Integrate the lobe itself over a hemisphere that faces it; a wider lobe keeps the value."""
     axis = np.array([0.48, 0.6, -0.64])
-    light = regression(sigma, axis)
+    light = a_regression(axis=axis, sigma=sigma)
     lobes = light.lobes(sigma_min)
     sharpness, amplitude = float(lobes.sharpness[0]), lobes.amplitude[0].astype(np.float64)
     assert sharpness == pytest.approx(1.0 / max(sigma, sigma_min) ** 2, rel=1e-6)

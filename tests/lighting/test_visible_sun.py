@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.builders.shapes import box
+from tests.builders.estimates import a_regression, box_before, even_ambient
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import Inputs
 from warpir.core.color import luminance
-from warpir.io.images.photos import Photo
 from warpir.lighting import estimate
 from warpir.lighting.regression import Regression
-from warpir.lighting.regressor import ambient_axes, candidates
 from warpir.lighting.visible_sun import (
     LOG_RATIO,
     LOG_TOTAL,
@@ -24,10 +21,8 @@ from warpir.lighting.visible_sun import (
     with_sun,
     with_visible_sun,
 )
-from warpir.scene.asset import Asset, Material
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.light import SUN_RADIUS_DEG, Lobes, axis_from_angles, fibonacci
-from warpir.scene.placement import place_asset
+from warpir.scene.light import SUN_RADIUS_DEG, axis_from_angles, fibonacci
 
 WIDTH, HEIGHT = 288, 192
 FLIP = np.array([-1.0, 1.0, 1.0])
@@ -40,28 +35,21 @@ def camera_of(pitch: float = 5.0, width: int = WIDTH) -> Camera:
 
 def regression_of(seed: int | None = None) -> Regression:
     """A regression that knows no direction, or is wrong about it, at random."""
-    directions = candidates(300)
-    probability = np.full(len(directions), 1.0 / len(directions))
-    axis = axis_from_angles(150.0, 40.0)
-    if seed is not None:
-        probability = np.random.default_rng(seed).dirichlet(np.full(len(directions), 0.3))
-    return Regression(
-        axis=axis,
+    plain = a_regression(
+        axis=axis_from_angles(150.0, 40.0),
         spread_deg=40.0,
         concentration=2.0,
-        directions=directions,
-        probability=probability,
         sun=np.array([1.2, 1.0, 0.8]),
         sun_log_std=0.7,
         sigma=0.1,
         share=0.2,
-        ambient=Lobes(
-            np.full((14, 3), 0.3, np.float32),
-            ambient_axes().astype(np.float32),
-            np.full(14, 4.0, np.float32),
-        ),
+        ambient=even_ambient(0.3),
         ambient_log_std=0.4,
     )
+    if seed is None:
+        return plain
+    count = len(plain.directions)
+    return replace(plain, probability=np.random.default_rng(seed).dirichlet(np.full(count, 0.3)))
 
 
 def rays_of(camera: Camera) -> NDArray[np.float64]:
@@ -265,13 +253,6 @@ def test_sure_regressor_counts_for_more(doubt: float) -> None:
     assert weight > 0.8 if doubt < 1.0 else weight < 0.05
 
 
-def inputs_of(photo: Picture, view: Camera) -> Inputs:
-    asset = Asset("box", (box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),), (Material(),))
-    placement = place_asset(*asset.bounds(), view, place=(0.0, 0.0, -5.0))
-    codes = np.round(255.0 * photo).astype(np.uint8)
-    return Inputs(Photo(codes, photo, "png"), asset, view, placement)
-
-
 @pytest.mark.parametrize("is_wanted", [True, False])
 def test_run_says_that_it_saw_the_sun(is_wanted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate takes the sun over and prints it; ``--no-visible-sun`` leaves the regression."""
@@ -280,7 +261,8 @@ def test_run_says_that_it_saw_the_sun(is_wanted: bool, monkeypatch: pytest.Monke
     monkeypatch.setattr(estimate, "load_regressor", lambda path: None)
     monkeypatch.setattr(estimate, "regress", lambda network, photo, camera: regression)
     config = InsertConfig(out="o", demo=True, visible_sun=is_wanted)
-    inputs = inputs_of(sunny(view, axis), view)
+    photo = sunny(view, axis)
+    inputs = box_before(view, photo, np.round(255.0 * photo).astype(np.uint8))
     seen = estimate.estimate_light(inputs, config.light, config.tone_operator)
     assert ("the photo shows the sun" in seen.light.assumed[0]) == is_wanted
     assert (seen.regression is regression) != is_wanted

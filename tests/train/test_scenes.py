@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 
+from tests.builders.estimates import write_envmap
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.kernels.training.scene import BOX, CYLINDER, ELLIPSOID, OccluderTable, is_open
 from warpir.lighting.latlong_tensors import luminance, shrunk, solid_angles
@@ -238,14 +239,9 @@ def test_made_up_lights_are_sound() -> None:
 
 
 def test_panoramas_of_nothing_but_sky_come_last(tmp_path: Path) -> None:
-    from warpir.io.results import OutputFolder
-
     texels = np.full((16, 32, 3), 0.5, np.float32)
-    for name in ("b_puresky", "c_place", "a_place"):
-        with OutputFolder(tmp_path / name) as folder:
-            folder.write_envmap(texels, name)
-    paths = sorted(tmp_path.glob("*/*.exr"))
-    pool = load_panoramas(paths, "cpu")
+    names = ("b_puresky", "c_place", "a_place")
+    pool = load_panoramas([write_envmap(tmp_path / name, name, texels) for name in names], "cpu")
     assert pool.panorama_count == 3 and pool.grounded_count == 2
     # Whatever the file's unit, the mean luminance is 1.
     mean = (luminance(pool.fine) * solid_angles(pool.fine)).sum(dim=(1, 2)) / (4.0 * np.pi)
