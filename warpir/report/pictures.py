@@ -49,10 +49,10 @@ class Shown:
     height: int
 
 
-def jpeg(codes: CodeArray, quality: int = 88) -> Shown:
+def jpeg(codes: CodeArray) -> Shown:
     """Encode 8-bit codes, shape [H, W, 3] or [H, W]."""
     stream = io.BytesIO()
-    Image.fromarray(codes).save(stream, "JPEG", quality=quality, subsampling=0)
+    Image.fromarray(codes).save(stream, "JPEG", quality=88, subsampling=0)
     return Shown(_uri("image/jpeg", stream.getvalue()), codes.shape[1], codes.shape[0])
 
 

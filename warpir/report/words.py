@@ -32,6 +32,13 @@ EDGES = (
     (180.0, "very soft, without an edge that could be seen"),
 )
 """Half width of the direct light [deg] up to which a shadow is called so."""
+STRENGTHS = (
+    (3.0, "strong direct light"),
+    (1.5, "more direct light than sky"),
+    (1.0 / 1.5, "direct light and sky of similar strength"),
+    (0.0, "mostly light from all around, with some direct light"),
+)
+"""Ratio of direct to other light on the ground from which it is called so [1]."""
 NEUTRAL, SLIGHT, STRONG = 0.08, 0.25, 0.55
 """Saturation (max - min) / max below which a colour is neutral or slight, and above strong [1]."""
 HUES = ("red", "orange", "yellow", "green", "green", "turquoise", "blue", "blue", "violet", "pink")
@@ -124,9 +131,7 @@ def _brightest(
 # ---------------------------------------------------------------------------------- words
 
 
-def light_rows(
-    character: LightCharacter, shadow: LightCharacter | None = None
-) -> list[tuple[str, str]]:
+def light_rows(character: LightCharacter, shadow: LightCharacter | None) -> list[tuple[str, str]]:
     """Describe a light as rows of a name and a text."""
     direct, sky = color_words(character.direct), color_words(character.sky)
     rows = [("direction", origin_words(character))]
@@ -188,14 +193,7 @@ def strength_words(character: LightCharacter) -> str:
         return "no direct light to speak of: the light comes from all around"
     ratio = share / max(1.0 - share, 1e-9)
     by = f"{ratio:.1f} times" if ratio < 100.0 else "more than 100 times"
-    if ratio >= 3.0:
-        what = "strong direct light"
-    elif ratio >= 1.5:
-        what = "more direct light than sky"
-    elif ratio >= 1.0 / 1.5:
-        what = "direct light and sky of similar strength"
-    else:
-        what = "mostly light from all around, with some direct light"
+    what = next(words for least, words in STRENGTHS if ratio >= least)
     return f"{what}: on the ground the direct part is {by} the rest"
 
 

@@ -48,9 +48,9 @@ def some_places(names: Sequence[str], count: int | None, known: Collection[str])
     """Return about that many panoramas, whole places each, the known ones of `of_fold` first."""
     if count is None:
         return set(names)
-    fresh = set(_shuffled(names, known))
+    fresh = _shuffled(names, known)
     chosen = {name for name in names if place_of(name) not in fresh}
-    for place in _shuffled(names, known):
+    for place in fresh:
         if len(chosen) >= count:
             break
         chosen |= {name for name in names if place_of(name) == place}

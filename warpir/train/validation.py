@@ -71,11 +71,7 @@ def measure(
         "below_25_deg": float((angle < 25.0).float().mean()),
         "spread_mean": float(torch.rad2deg(spread).mean()),
         "nll": float(-(labels * prediction.logits[chosen].log_softmax(1)).sum(1).mean()),
-        "coverage": float(
-            (region_mass(loss.directions, probability, answers.axis[chosen]) <= COVERAGE)
-            .float()
-            .mean()
-        ),
+        "coverage": coverage(loss.directions, probability, answers.axis[chosen]),
         "sun_error": float(level.abs().mean()),
         "sun_coverage": float(
             (level.abs() < torch.exp(0.5 * prediction.level_log_var[chosen])).float().mean()
@@ -119,6 +115,11 @@ def region_mass(directions: Tensor, probability: Tensor, axis: Tensor) -> Tensor
     return above + 0.5 * own[:, 0]
 
 
+def coverage(directions: Tensor, probability: Tensor, axis: Tensor) -> float:
+    """Return the share of truths in their regions of probability `COVERAGE`; see `region_mass`."""
+    return float((region_mass(directions, probability, axis) <= COVERAGE).float().mean())
+
+
 def calibrated_temperature(directions: Tensor, sets: Sequence[tuple[Tensor, Tensor]]) -> float:
     """Return the temperature at which the 68 % region holds the truth in 68 % of the photos.
 
@@ -128,20 +129,12 @@ def calibrated_temperature(directions: Tensor, sets: Sequence[tuple[Tensor, Tens
         directions: Candidates, shape [K, 3].
         sets: Logits [B, K] and true axes [B, 3] of each set.
     """
-    found, gap = 1.0, math.inf
-    for temperature in np.geomspace(0.25, 8.0, 126):
-        covered = [
-            float(
-                (region_mass(directions, (logits / temperature).softmax(1), axis) <= COVERAGE)
-                .float()
-                .mean()
-            )
-            for logits, axis in sets
-        ]
-        distance = abs(sum(covered) / len(covered) - COVERAGE)
-        if distance < gap:
-            found, gap = float(temperature), distance
-    return found
+
+    def gap(temperature: float) -> float:
+        covered = [coverage(directions, (x / temperature).softmax(1), axis) for x, axis in sets]
+        return abs(sum(covered) / len(covered) - COVERAGE)
+
+    return float(min(np.geomspace(0.25, 8.0, 126), key=gap))
 
 
 @torch.no_grad()
