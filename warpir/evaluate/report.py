@@ -7,7 +7,7 @@ the same is given with whole panoramas drawn.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
@@ -258,22 +258,24 @@ def tables(
             scenes = max(
                 (m.count for rows in summary.values() for m in rows[group].values()), default=0
             )
-            if not shown:
-                continue
-            yield f"## {title}: {group} ({scenes} scenes)"
-            yield ""
-            yield "| row | " + " | ".join(name for name, _ in shown) + " |"
-            yield "|---" * (len(shown) + 1) + "|"
-            for row, groups in summary.items():
-                cells = [_cell(groups[group].get(figure)) for _, figure in shown]
-                yield f"| {row} | " + " | ".join(cells) + " |"
-            yield ""
-    yield "## Rows"
+            if shown:
+                rows = [
+                    [row, *(_cell(groups[group].get(figure)) for _, figure in shown)]
+                    for row, groups in summary.items()
+                ]
+                heading = f"{title}: {group} ({scenes} scenes)"
+                yield from _table(heading, ["row", *(name for name, _ in shown)], rows)
+    yield from _table("Rows", ["row", "what it is"], [[row, words[row]] for row in summary])
+
+
+def _table(heading: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield a table under its heading as lines of Markdown."""
+    yield f"## {heading}"
     yield ""
-    yield "| row | what it is |"
-    yield "|---|---|"
-    for row in summary:
-        yield f"| {row} | {words[row]} |"
+    yield f"| {' | '.join(columns)} |"
+    yield "|---" * len(columns) + "|"
+    for cells in rows:
+        yield f"| {' | '.join(cells)} |"
     yield ""
 
 
@@ -316,12 +318,7 @@ def by_kind(entries: Sequence[Entry]) -> dict[str, dict[str, dict[str, float]]]:
 
 def kind_table(kinds: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterator[str]:
     """Yield the table of `by_kind` as lines of Markdown."""
-    if not kinds:
-        return
-    yield "## By kind of place"
-    yield ""
-    yield "| kind | scenes (places) | row | " + " | ".join(w for w, _ in KIND_COLUMNS) + " |"
-    yield "|---" * (len(KIND_COLUMNS) + 3) + "|"
+    lines = []
     for kind, rows in kinds.items():
         for row, means in rows.items():
             cells = [
@@ -331,28 +328,25 @@ def kind_table(kinds: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Iterat
                 for _, figure in KIND_COLUMNS
             ]
             counts = f"{means['scenes']:.0f} ({means['panoramas']:.0f})"
-            yield f"| {kind} | {counts} | {row} | " + " | ".join(cells) + " |"
-    yield ""
+            lines.append([kind, counts, row, *cells])
+    if lines:
+        columns = ["kind", "scenes (places)", "row", *(words for words, _ in KIND_COLUMNS)]
+        yield from _table("By kind of place", columns, lines)
 
 
 def pair_table(pairs: Sequence[Pair]) -> Iterator[str]:
     """Yield the comparisons as lines of Markdown; groups of objects are left to the JSON file."""
-    shown = [p for p in pairs if p.group in ("all", "sunny")]
-    if not shown:
-        return
-    sure = f"* the 95 % interval excludes 0, with {FEWEST} scenes or more"
-    yield f"## In pairs, scene by scene (below 0: better; {sure})"
-    yield ""
-    yield "| row | against | figure | group | difference | better / worse |"
-    yield "|---|---|---|---|---|---|"
-    for p in shown:
+    rows = []
+    for p in (p for p in pairs if p.group in ("all", "sunny")):
         against = f"{p.against} (its start)" if p.is_start else p.against
-        star = " *" if p.difference.is_sure else ""
-        yield (
-            f"| {p.row} | {against} | {p.figure} | {p.group} | {_cell(p.difference)}{star} "
-            f"| {p.better} / {p.worse} |"
-        )
-    yield ""
+        difference = _cell(p.difference) + (" *" if p.difference.is_sure else "")
+        counts = f"{p.better} / {p.worse}"
+        rows.append([p.row, against, p.figure, p.group, difference, counts])
+    if rows:
+        sure = f"* the 95 % interval excludes 0, with {FEWEST} scenes or more"
+        heading = f"In pairs, scene by scene (below 0: better; {sure})"
+        columns = ["row", "against", "figure", "group", "difference", "better / worse"]
+        yield from _table(heading, columns, rows)
 
 
 def _cell(mean: Mean | None) -> str:

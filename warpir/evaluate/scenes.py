@@ -16,7 +16,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import count
 from pathlib import Path
 from typing import TypeVar
@@ -281,9 +281,9 @@ class Places:
         self.height = round(width / ASPECT)
         self.notices: list[str] = []
         self._radiance: dict[Path, FloatArray] = {}
-        self._assets: dict[Path, Asset] = {}
         self._panoramas = self._usable(panoramas, self._read_panorama, "--panoramas", 0)
-        self._subjects = self._usable(assets, self._read_asset, "--assets", 1)
+        read_asset = cache(lambda path: load_asset(path, "grey"))
+        self._subjects = self._usable(assets, read_asset, "--assets", 1)
 
     def _usable(
         self, paths: Sequence[Path], read: Callable[[Path], Read], where: str, stream: int
@@ -310,11 +310,6 @@ class Places:
             raise InputError(path, "all black")
         self._radiance.setdefault(path, resize_map(texels, LIGHT_HEIGHT))
         return texels
-
-    def _read_asset(self, path: Path) -> Asset:
-        if path not in self._assets:
-            self._assets[path] = load_asset(path, "grey")
-        return self._assets[path]
 
     def make(self, number: int) -> list[tuple[Place, list[Subject]]]:
         """Return the first ``number`` places, each with a diffuse and a glossy subject.
