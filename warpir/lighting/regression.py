@@ -24,7 +24,7 @@ from warpir.lighting.regressor import (
     mean_luminance,
 )
 from warpir.scene.camera import Camera
-from warpir.scene.light import Lobes, angles_from_axis
+from warpir.scene.light import Light, Lobes, angles_from_axis
 
 LOG_STD_MIN, LOG_STD_MAX = 0.1, 0.7
 """Least and greatest standard deviation that a log intensity is believed to have: without the
@@ -76,6 +76,16 @@ class Regression:
             np.concatenate([self.axis[None], self.ambient.axis]).astype(np.float32),
             np.append(sharpness, self.ambient.sharpness).astype(np.float32),
         )
+
+    def irradiance(self, normal: Float64Array) -> Float64Array:
+        """Return the expected irradiance of a surface over all directions, linear RGB, shape [3].
+
+        Args:
+            normal: Unit, world frame, shape [3].
+        """
+        cosine = float(np.maximum(self.directions @ normal, 0.0) @ self.probability)
+        rest: Float64Array = Light(lobes=self.ambient).irradiance(normal)
+        return cosine * self.sun + rest
 
     def record(self) -> dict[str, Any]:
         """Return plain values for ``run.json``."""
