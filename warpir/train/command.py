@@ -50,31 +50,30 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m warpir.train", description=__doc__.partition("\n")[0]
     )
-    parser.add_argument("network", choices=("camera", "regressor"))
-    parser.add_argument("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
-    parser.add_argument(
-        "--validation", nargs="*", default=[], metavar="NAME", help="only looked at"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--minutes", type=float, default=9.0, help="of this command")
-    parser.add_argument("--total-minutes", type=float, help="of all commands together")
-    parser.add_argument("--batch", type=int, default=None)
+    add = parser.add_argument
+    add("network", choices=("camera", "regressor"))
+    add("--panoramas", type=Path, nargs="+", required=True, metavar="DIR")
+    add("--without", nargs="*", default=[], metavar="NAME", help="not learned from")
+    add("--validation", nargs="*", default=[], metavar="NAME", help="only looked at")
+    add("--out", type=Path, required=True, metavar="DIR")
+    add("--minutes", type=float, default=9.0, help="of this command")
+    add("--total-minutes", type=float, help="of all commands together")
+    add("--batch", type=int, default=None)
     words = "largest learning rate (default: 1e-3; 3e-4 suits weights to begin with)"
-    parser.add_argument("--rate", type=float, metavar="R", help=words)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--start", type=Path, metavar="FILE", help="weights to begin with")
+    add("--rate", type=float, metavar="R", help=words)
+    add("--seed", type=int, default=0)
+    add("--device", default=None)
+    add("--resume", action="store_true")
+    add("--start", type=Path, metavar="FILE", help="weights to begin with")
     words = "weights whose first layers the camera's network begins with"
-    parser.add_argument("--regressor", type=Path, metavar="FILE", help=words)
+    add("--regressor", type=Path, metavar="FILE", help=words)
     words = "networks, each without a share of the places; their answers are averaged"
-    parser.add_argument("--networks", type=int, default=1, metavar="N", help=words)
+    add("--networks", type=int, default=1, metavar="N", help=words)
     words = "hold out the places of fold K of N, for validation and calibration"
-    parser.add_argument("--fold", type=_fold, metavar="K/N", help=words)
+    add("--fold", type=_fold, metavar="K/N", help=words)
     words = "panoramas to learn from, whole places drawn at random"
-    parser.add_argument("--places", type=int, metavar="N", help=words)
-    parser.add_argument("--no-compile", action="store_true", help="do without torch.compile")
+    add("--places", type=int, metavar="N", help=words)
+    add("--no-compile", action="store_true", help="do without torch.compile")
     return parser
 
 

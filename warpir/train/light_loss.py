@@ -151,17 +151,14 @@ class MeanLight:
             "weight": weight.sum(),
             "count": torch.tensor(float(len(weight)), device=weight.device),
             "labels": weight @ targets["labels"],
-            "level": weight @ targets["level"],
-            "level_square": weight @ targets["level"] ** 2,
-            "tint": weight @ targets["tint"],
-            "tint_square": weight @ targets["tint"] ** 2,
-            "softness": weight @ targets["softness"],
-            "softness_square": weight @ targets["softness"] ** 2,
             "share": targets["share"].sum(),
             "ambient": torch.log(targets["ambient"] + MAP_FLOOR).sum(dim=0),
             "ambient_level": ambient_level.sum(),
             "ambient_level_square": (ambient_level**2).sum(),
         }
+        for name in ("level", "tint", "softness"):
+            parts[name] = weight @ targets[name]
+            parts[f"{name}_square"] = weight @ targets[name] ** 2
         for name, part in parts.items():
             kept = self.sums.get(name)
             self.sums[name] = part.double() if kept is None else kept + part

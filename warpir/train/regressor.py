@@ -28,6 +28,7 @@ from warpir.lighting.regressor import split
 from warpir.train.augmentation import augment
 from warpir.train.batches import PhotoBatch
 from warpir.train.light_loss import TERM_WEIGHTS, LightLoss, MeanLight
+from warpir.train.networks.files import plain_sizes
 from warpir.train.networks.regressor import (
     RegressorConfig,
     RegressorModule,
@@ -185,10 +186,8 @@ class _Run:
             InputError: There is none.
         """
         held = checkpoints_of(out).load(log.warning).state
-        config: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in held["config"].items()
-        }
-        run = cls(out, RegressorModule(RegressorConfig(**config)), settings, device)
+        config = RegressorConfig(**plain_sizes(held["config"]))
+        run = cls(out, RegressorModule(config), settings, device)
         run.network.load_state_dict(held["weights"])
         run.average.load_state_dict(held["average"])
         run.step, run.minutes = held["step"], held["minutes"]

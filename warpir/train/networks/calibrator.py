@@ -161,6 +161,7 @@ def save_calibrator(network: CalibratorModule, path: Path, record: Mapping[str, 
 def read_calibrator(path: Path | None, device: str | torch.device = "cpu") -> CalibratorModule:
     """Read a network for training; see `read_weights`."""
     weights = read_weights(check_calibrator, shapes, path)
-    network = filled(CalibratorModule(CalibratorConfig(**plain_sizes(weights))), weights, device)
+    config = CalibratorConfig(**plain_sizes(weights.sizes))
+    network = filled(CalibratorModule(config), weights, device)
     network.record = weights.record
     return network

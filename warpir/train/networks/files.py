@@ -33,9 +33,9 @@ def weights_of(network: nn.Module, config: TokenSizes, record: Mapping[str, Any]
     return Weights(asdict(config), values, record)
 
 
-def plain_sizes(weights: Weights) -> dict[str, Any]:
-    """Return the sizes of a file as fields of its `TokenSizes`."""
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in weights.sizes.items()}
+def plain_sizes(sizes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return sizes that were read from JSON as fields of `TokenSizes`."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in sizes.items()}
 
 
 def filled(network: Network, weights: Weights, device: str | torch.device) -> Network:

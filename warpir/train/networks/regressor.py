@@ -158,6 +158,7 @@ def save_regressor(network: RegressorModule, path: Path, record: Mapping[str, An
 def read_regressor(path: Path | None, device: str | torch.device = "cpu") -> RegressorModule:
     """Read a network for training; see `read_weights`."""
     weights = read_weights(check_regressor, shapes, path)
-    network = filled(RegressorModule(RegressorConfig(**plain_sizes(weights))), weights, device)
+    config = RegressorConfig(**plain_sizes(weights.sizes))
+    network = filled(RegressorModule(config), weights, device)
     network.record = weights.record
     return network
