@@ -1,5 +1,6 @@
 """Image files made by code, for the tests of what is read and written."""
 
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 from PIL import Image
+
+from warpir.io.results import OutputFolder
 
 OIIO_TYPES = {"uint8": "uint8", "uint16": "uint16", "float16": "half", "float32": "float"}
 
@@ -138,4 +141,13 @@ def with_chunks(path: Path, codes: np.ndarray, *chunks: bytes, **options: Any) -
     Image.fromarray(codes).save(path, **options)
     content = path.read_bytes()
     path.write_bytes(content[:33] + b"".join(chunks) + content[33:])
+    return path
+
+
+def write_envmap(folder: Path, name: str, texels: np.ndarray, kind: str = "exr") -> Path:
+    """Write one panorama and nothing else into a folder, which need not be there."""
+    with OutputFolder(folder / "made", overwrite=True) as output:
+        output.write_envmap(texels, name)
+    path = (folder / "made" / f"{name}.{kind}").rename(folder / f"{name}.{kind}")
+    shutil.rmtree(folder / "made")
     return path

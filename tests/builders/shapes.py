@@ -1,16 +1,22 @@
-"""Small meshes, cameras and lights that render tests share; every number is chosen by the test."""
+"""Small meshes, cameras and lights that tests share, and estimates of these from a photo."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from warpir.core.arrays import Float64Array, IntArray
+from warpir.app.inputs import Inputs
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.io.images.photos import Photo
+from warpir.lighting.regression import Regression
+from warpir.lighting.regressor import AMBIENT_SHARPNESS, ambient_axes, candidates
 from warpir.render.device_scene import Placed, Receiver
 from warpir.scene.asset import Asset, Material, Primitive, Texture
-from warpir.scene.camera import Camera
-from warpir.scene.light import Light, Lobes
+from warpir.scene.camera import Camera, CameraEstimate
+from warpir.scene.light import Light, Lobes, axis_from_angles
+from warpir.scene.placement import place_asset
 
 DEEP = -1e3
 """Height of a ground plane that is in nobody's way [m]."""
@@ -124,3 +130,52 @@ def lobe(axis: ArrayLike, sharpness: float, amplitude: ArrayLike = (1.0, 1.0, 1.
             np.array([sharpness], np.float32),
         )
     )
+
+
+def even_ambient(radiance: float) -> Lobes:
+    """The regressor's lobes of all other light, equal and white."""
+    axes = ambient_axes().astype(np.float32)
+    sharpness = np.full(len(axes), AMBIENT_SHARPNESS, np.float32)
+    return Lobes(np.full((len(axes), 3), radiance, np.float32), axes, sharpness)
+
+
+def a_regression(**changes: Any) -> Regression:
+    """A sun of which no direction is likelier than another, and no other light."""
+    directions = candidates(300)
+    plain: dict[str, Any] = {
+        "axis": axis_from_angles(20.0, 50.0),
+        "spread_deg": 10.0,
+        "concentration": 20.0,
+        "directions": directions,
+        "probability": np.full(len(directions), 1.0 / len(directions)),
+        "sun": np.array([3.0, 2.5, 1.5]),
+        "sun_log_std": 0.3,
+        "sigma": 0.05,
+        "share": 0.6,
+        "ambient": even_ambient(0.0),
+        "ambient_log_std": 0.2,
+    }
+    return Regression(**plain | changes)
+
+
+def a_camera(**changes: Any) -> CameraEstimate:
+    """A level camera of 50 degrees, as unsure in every number."""
+    plain: dict[str, Any] = {
+        "pitch_deg": 0.0,
+        "roll_deg": 0.0,
+        "vfov_deg": 50.0,
+        "principal": (0.5, 0.5),
+        "pitch_sigma_deg": 1.0,
+        "roll_sigma_deg": 1.0,
+        "vfov_sigma_deg": 1.0,
+        "principal_sigma": (0.1, 0.1),
+        "witnesses": (),
+    }
+    return CameraEstimate(**plain | changes)
+
+
+def box_before(view: Camera, srgb: FloatArray, codes: np.ndarray) -> Inputs:
+    """A photo of level ground, and a box of a metre that stands on it, five metres ahead."""
+    asset = Asset("box", (box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),), (Material(),))
+    placement = place_asset(*asset.bounds(), view, place=(0.0, 0.0, -5.0))
+    return Inputs(Photo(codes, srgb, "png"), asset, view, placement)

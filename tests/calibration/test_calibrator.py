@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import warpir.demo
-from tests.builders.estimates import a_camera
+from tests.builders.shapes import a_camera
 from warpir.calibration.estimate import LINES, decided, estimate_camera
 from warpir.calibration.lines import find_segments, upright_roll
 from warpir.calibration.network import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.builders.estimates import write_envmap
+from tests.builders.image_files import write_envmap
 from warpir.evaluate.camera.measure import (
     constant_camera,
     corrected_to_upright,

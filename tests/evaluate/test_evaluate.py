@@ -9,7 +9,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-from tests.builders.estimates import a_camera, write_envmap
+from tests.builders.image_files import write_envmap
+from tests.builders.shapes import a_camera
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.core.arrays import FloatArray

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from tests import oracles
-from tests.builders.estimates import write_envmap
+from tests.builders.image_files import write_envmap
 from warpir.core.color import linear_to_gamma
 from warpir.core.errors import InputError
 from warpir.core.latlong import map_directions, texel_solid_angles

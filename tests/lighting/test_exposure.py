@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.builders.estimates import a_regression, box_before, even_ambient
-from tests.builders.shapes import camera
+from tests.builders.shapes import a_regression, box_before, camera, even_ambient
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import FloatArray

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
-from tests.builders.estimates import a_regression
+from tests.builders.shapes import a_regression
 from warpir.calibration.forward import softmax
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.builders.estimates import a_regression, box_before, even_ambient
+from tests.builders.shapes import a_regression, box_before, even_ambient
 from warpir.app.config import InsertConfig
 from warpir.core.color import luminance
 from warpir.lighting import estimate

@@ -7,7 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.builders.estimates import write_envmap
+from tests.builders.image_files import write_envmap
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.kernels.training.scene import BOX, CYLINDER, ELLIPSOID, OccluderTable, is_open
 from warpir.lighting.latlong_tensors import luminance, shrunk, solid_angles
