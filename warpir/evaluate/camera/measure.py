@@ -34,6 +34,8 @@ RANGES = {"pitch": (-40.0, 25.0), "roll": (-20.0, 20.0), "fov": (25.0, 95.0)}
 """Least and greatest pitch, roll and field of view of the shorter side [deg]."""
 SIDE = 8
 """Sides of the photographs are multiples of this, as JPEG's blocks are [px]."""
+UPRIGHT = ("recognised", "mistaken", "axis", "axis_constant")
+"""What is measured of photographs that are corrected to upright; see `measure_cameras`."""
 Errors = dict[str, list[float]]
 
 
@@ -162,22 +164,26 @@ def measure_cameras(
         _add_covered(covered, truth, estimate)
         level = corrected_to_upright(one, Sampler(1, other))
         seen = network_estimate(photograph(panorama, level, width, other), network)
-        upright, axis = decided(seen), float(level.y[0])
-        recognised, mistaken = upright.is_upright_corrected, estimate.is_upright_corrected
-        corrected.append((recognised, mistaken, abs(upright.principal[1] - axis), abs(0.5 - axis)))
+        corrected.append(_upright(estimate, decided(seen), float(level.y[0])))
     summary: dict[str, Any] = {row: _summary(parts) for row, parts in errors.items()}
     for name, inside in covered.items():
         summary["estimated"][name]["within_sigma"] = float(np.mean(inside))
     summary["estimated"]["seconds"] = float(np.median(seconds))
     summary["estimated"]["with_lines"] = by_lines / scenes
-    shares, medians = np.mean(corrected, axis=0), np.median(corrected, axis=0)
-    summary["corrected"] = {
-        "recognised": float(shares[0]),
-        "mistaken": float(shares[1]),
-        "axis": float(medians[2]),
-        "axis_constant": float(medians[3]),
-    }
+    summary["corrected"] = _upright_summary(corrected)
     return summary | {"panoramas": sorted(used), "notices": notices}
+
+
+def _upright(plain: CameraEstimate, corrected: CameraEstimate, axis: float) -> tuple[float, ...]:
+    """Return `UPRIGHT` of one photograph of either kind; the row is the second's true axis."""
+    off, off_middle = abs(corrected.principal[1] - axis), abs(0.5 - axis)
+    return corrected.is_upright_corrected, plain.is_upright_corrected, off, off_middle
+
+
+def _upright_summary(photographs: Sequence[tuple[float, ...]]) -> dict[str, float]:
+    """Return shares and median errors by `UPRIGHT`."""
+    shares, medians = np.mean(photographs, axis=0), np.median(photographs, axis=0)
+    return dict(zip(UPRIGHT, [*shares[:2].tolist(), *medians[2:].tolist()], strict=True))
 
 
 def _shuffled(
