@@ -137,9 +137,9 @@ def softness(camera: Camera, columns: int) -> Float64Array:
     itself comes on top, and is not known.
     """
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    local = np.stack([(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)])
-    distance = np.linalg.norm(local, axis=0)
-    upward = np.einsum("k,khw->hw", camera.c2w[1, :3], local) / distance
+    local = camera.toward(u, v)
+    distance = np.linalg.norm(local, axis=-1)
+    upward = local @ camera.c2w[1, :3] / distance
     pixel = 1.0 / (camera.fx * camera.fy * distance**3)
     texel = (2.0 * np.pi / columns) ** 2 * np.sqrt(1.0 - upward**2)
     variance = texel / pixel / 6.0 + 1.0 / 16.0 - PIXEL_SIGMA**2

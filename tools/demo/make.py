@@ -67,8 +67,7 @@ def write_light(texels: NDArray[np.float32], path: Path) -> None:
 def pixel_directions(view: Camera) -> NDArray[np.float64]:
     """Return unit directions through the pixel centres, world frame, shape [H, W, 3]."""
     v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
-    local = np.stack([(u - view.cx) / view.fx, -(v - view.cy) / view.fy, -np.ones_like(u)], axis=2)
-    world = local @ view.c2w[:3, :3].T
+    world = view.toward(u, v) @ view.c2w[:3, :3].T
     directions: NDArray[np.float64] = world / np.linalg.norm(world, axis=2, keepdims=True)
     return directions
 

@@ -108,10 +108,7 @@ def crop_radiance(texels: FloatArray, camera: Camera, side: int = 2) -> Float64A
             u, v = np.meshgrid(
                 np.arange(camera.width) + offset_u, np.arange(camera.height) + offset_v
             )
-            local = np.stack(
-                [(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)], -1
-            )
-            directions = local @ camera.c2w[:3, :3].T
+            directions = camera.toward(u, v) @ camera.c2w[:3, :3].T
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
             total += look_up(texels, directions)
     return total / side**2

@@ -138,8 +138,7 @@ def ground_in_view(inputs: Inputs) -> tuple[Float64Array, int]:
         (np.arange(columns) + 0.5) * camera.width / columns,
         (np.arange(rows) + 0.5) * camera.height / rows,
     )
-    local = np.stack([(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)])
-    rays = (camera.c2w[:3, :3] @ local.reshape(3, -1)).T
+    rays = camera.toward(u, v).reshape(-1, 3) @ camera.c2w[:3, :3].T
     eye, normal = camera.c2w[:3, 3], plane[:3]
     height = float(eye @ normal + plane[3])
     distance = float(np.linalg.norm(foot_of(inputs) - eye))

@@ -139,8 +139,7 @@ def camera_rays(camera: Camera, height: int = HEIGHT, width: int = WIDTH) -> Flo
     """
     view = camera.scaled(width, height)
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], axis=-1)
-    rays = local @ (yaw_to_world(camera).T @ camera.c2w[:3, :3]).T
+    rays = view.toward(u, v) @ (yaw_to_world(camera).T @ camera.c2w[:3, :3]).T
     unit: FloatArray = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
     return unit
 

@@ -167,7 +167,7 @@ def _shrunk(shown: AnyFloatArray, camera: Camera) -> tuple[Float64Array, Camera]
 def _pixel_rays(view: Camera) -> tuple[Float64Array, Float64Array]:
     """Return pixels' unit directions, world frame, [H, W, 3], and solid angles [sr], [H, W]."""
     u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    local = np.stack([(u - view.cx) / view.fx, (view.cy - v) / view.fy, -np.ones_like(u)], -1)
+    local = view.toward(u, v)
     square = (local**2).sum(axis=-1)
     rays = local @ view.c2w[:3, :3].T / np.sqrt(square)[..., None]
     return rays, square**-1.5 / (view.fx * view.fy)

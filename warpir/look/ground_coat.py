@@ -182,8 +182,7 @@ def _unrolled(linear: AnyFloatArray, camera: Camera, up: Float64Array) -> _View:
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
     to_camera = np.stack([np.cross(ahead, up), up, ahead]) @ camera.c2w[:3, :3]
     v, u = np.meshgrid(np.linspace(0, height, 33), np.linspace(0, width, 33), indexing="ij")
-    local = np.stack([(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, 0.0 * u - 1.0], -1)
-    right, above, forward = np.moveaxis(local @ to_camera.T, -1, 0)
+    right, above, forward = np.moveaxis(camera.toward(u, v) @ to_camera.T, -1, 0)
     azimuth = np.degrees(np.arctan2(right, forward)).clip(-LEVEL, LEVEL)
     elevation = np.degrees(np.arctan2(above, np.hypot(right, forward)))
     columns = np.arange(azimuth.min(), azimuth.max(), STEP)

@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warpir.core.arrays import BoolArray, Float64Array, IntArray
 from warpir.core.errors import ExitCode, InputError
@@ -133,10 +134,15 @@ class Camera:
         mask: BoolArray = near.repeat(TILE, axis=0).repeat(TILE, axis=1)
         return mask[: self.height, : self.width]
 
+    def toward(self, u: ArrayLike, v: ArrayLike) -> Float64Array:
+        """Return the directions of image positions [px], camera frame, z = -1, shape [..., 3]."""
+        x = (np.asarray(u, np.float64) - self.cx) / self.fx
+        y = (self.cy - np.asarray(v, np.float64)) / self.fy
+        return np.stack([x, y, np.full_like(x, -1.0)], axis=-1)
+
     def ray(self, u: float, v: float) -> tuple[Float64Array, Float64Array]:
         """Return origin [m] and unit direction, world frame, through pixel position (u, v)."""
-        local = np.array([(u - self.cx) / self.fx, -(v - self.cy) / self.fy, -1.0])
-        direction = self.c2w[:3, :3] @ local
+        direction = self.c2w[:3, :3] @ self.toward(u, v)
         return self.c2w[:3, 3].copy(), direction / np.linalg.norm(direction)
 
     def record(self) -> dict[str, Any]:

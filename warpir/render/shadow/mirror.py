@@ -45,15 +45,7 @@ def mirror_pixels(renderer: Renderer, wanted: BoolArray, roughness: float) -> In
         return np.zeros(0, np.int32)
     pixels = np.flatnonzero(wanted)
     v, u = np.divmod(pixels, camera.width)
-    local = np.stack(
-        [
-            (u + 0.5 - camera.cx) / camera.fx,
-            (camera.cy - v - 0.5) / camera.fy,
-            np.full(len(pixels), -1.0),
-        ],
-        axis=-1,
-    )
-    ray = local @ camera.c2w[:3, :3].T
+    ray = camera.toward(u + 0.5, v + 0.5) @ camera.c2w[:3, :3].T
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     eye = camera.c2w[:3, 3]
     down = ray @ plane.normal
