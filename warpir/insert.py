@@ -122,7 +122,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
         lit = find_light(run, given)
         with sparing():
             has_preview = given is None and not run.config.is_guided
-            with no_collection(), lit.run.timings.stage("preview"), ThreadPoolExecutor(2) as pool:
+            with no_collection(), ThreadPoolExecutor(2) as pool:
                 # On the host the preview has all cores, and comes first.
                 if has_preview and run.device == "cpu":
                     write_preview(lit.run, lit.light)
@@ -130,8 +130,9 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 look = pool.submit(look_of, lit.run, lit.light)
                 if has_preview and run.device != "cpu":
                     write_preview(lit.run, lit.light)
-            lit = detailed.result()
-            rendered = render_result(lit.run, lit.light, look.result())
+                with run.timings.stage("scene"):
+                    lit, seen = detailed.result(), look.result()
+            rendered = render_result(lit.run, lit.light, seen)
             record = _write(lit, rendered, config)
     say(summary_line(record))
     record = read_json_object(output.path / "run.json")
@@ -141,10 +142,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
 def _read(
     config: InsertConfig, loaders: "Loaders | None" = None
 ) -> "tuple[Run, SceneLight | None]":
-    """Read and check all inputs and print the assumptions; the demo has inputs of its own.
-
-    The light is None where it is to be estimated. The output folder is not entered.
-    """
+    """Read and check what is given, and print what is assumed; None: the light is not given."""
     from warpir.app.inputs import read_inputs
     from warpir.app.record import Timings
     from warpir.app.run import Run

@@ -110,8 +110,9 @@ def _photo_outline(camera: Mapping[str, Any], pose: Float64Array) -> str | None:
 def rgbe(linear: FloatArray) -> CodeArray:
     """Return values as three mantissas and an exponent (Ward 1991), shape [H, W, 4]."""
     largest = linear.max(axis=-1)
-    _, exponent = np.frexp(largest)
-    scale = np.where(largest > 1e-32, np.ldexp(np.float32(256.0), -exponent), 0.0)
+    is_lit = largest > 1e-32
+    _, exponent = np.frexp(np.where(is_lit, largest, np.float32(1.0)))
+    scale = np.where(is_lit, np.ldexp(np.float32(256.0), -exponent), 0.0)
     mantissas = np.minimum(linear * scale[..., None], 255.0).astype(np.uint8)
-    exponents = np.where(largest > 1e-32, exponent + 128, 0).astype(np.uint8)
+    exponents = np.where(is_lit, exponent + 128, 0).astype(np.uint8)
     return np.concatenate([mantissas, exponents[..., None]], axis=-1)

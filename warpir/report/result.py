@@ -91,17 +91,18 @@ def write_preview(run: Run, light: SceneLight) -> None:
     settings = run.config.optimize
     if not settings.preview_every:
         return
-    run = replace(run, inputs=_small_inputs(run.inputs))
-    camera = _rendering_camera(run.inputs.camera, run.config.render.width)
-    # Of a photo that is enlarged, no more than the photo has.
-    width = min(settings.guidance_width, camera.width, run.inputs.camera.width)
-    camera = _rendering_camera(run.inputs.camera, width)
-    placed = scene_of(run.inputs, camera, run.device, light.curves)
-    asked = run.config.render
-    renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
-    picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
-    codes = run.inputs.photo.encode(picture.image, picture.changed)
-    run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
+    with run.timings.stage("preview"):
+        run = replace(run, inputs=_small_inputs(run.inputs))
+        camera = _rendering_camera(run.inputs.camera, run.config.render.width)
+        # Of a photo that is enlarged, no more than the photo has.
+        width = min(settings.guidance_width, camera.width, run.inputs.camera.width)
+        camera = _rendering_camera(run.inputs.camera, width)
+        placed = scene_of(run.inputs, camera, run.device, light.curves)
+        asked = run.config.render
+        renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
+        picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
+        codes = run.inputs.photo.encode(picture.image, picture.changed)
+        run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
 
 def _small_inputs(inputs: Inputs) -> Inputs:

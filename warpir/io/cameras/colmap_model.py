@@ -16,6 +16,7 @@ import numpy as np
 from warpir.core.arrays import Float64Array
 from warpir.core.errors import Faults, InputError
 from warpir.core.limits import LIMITS, Limits
+from warpir.io.cameras.source import SIZE_LIMIT
 
 MODELS = {
     "SIMPLE_PINHOLE": 3,
@@ -34,8 +35,6 @@ MODELS = {
 """Number of parameters by model, in the order of their binary ids."""
 POINT_BYTES = 24
 """Of an image's point in ``images.bin``: two coordinates and the id of its 3D point."""
-SIZE_LIMIT = 1_000_000
-"""Widest image taken for one [px]."""
 COLMAP = Faults(
     "colmap",
     {

@@ -18,6 +18,8 @@ LARGEST = 1e15
 """Largest number of a camera: of a matrix, an offset, a focal length."""
 SHORTEST = 1e-6
 """Shortest focal length [px]: one pixel sees 179.9999 degrees, and squares of rays are finite."""
+SIZE_LIMIT = 1_000_000
+"""Widest and highest image taken for one [px]."""
 NAMES_SHOWN = 8
 CAMERA = Faults(
     "camera",
@@ -224,6 +226,6 @@ def angle(path: Path, content: Any, key: str) -> float:
 def count(path: Path, content: Any, key: str) -> int:
     """Return an image size of an object [px], or refuse the file."""
     value = number(path, content, key)
-    if value != int(value) or not 1 <= value <= 1_000_000:
+    if value != int(value) or not 1 <= value <= SIZE_LIMIT:
         raise CAMERA.error(path, "size", pointer=f"/{key}", found=value, expected="whole pixels")
     return int(value)
