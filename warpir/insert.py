@@ -117,7 +117,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 from warpir.optimize.find_light import find_light, with_photo_detail
                 from warpir.report.result import look_of, render_result, write_preview
 
-        run = run.on_device(device.result()).with_ground_coat()
+            run = run.on_device(device.result()).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
         with sparing():
