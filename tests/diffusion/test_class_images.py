@@ -22,6 +22,7 @@ from warpir.diffusion.personalization.class_images import (
     encode_pictures,
     make_class_images,
 )
+from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import (
     BACKGROUNDS,
     COLOURS,
@@ -65,6 +66,9 @@ class Painter:
         key = [content_key(p, s, steps, scale) for p, s in zip(prompts, seeds, strict=True)]
         random = [torch.Generator().manual_seed(int(k[:12], 16)) for k in key]
         return torch.stack([torch.rand(3, 16, 16, generator=g) for g in random])
+
+    def upcast(self) -> bool:
+        return False
 
 
 # Prompts
@@ -269,6 +273,15 @@ def test_none_are_made_for_the_ablation(tmp_path: Path) -> None:
     made = make_class_images(painter, PROMPTS, replace(SETTINGS, class_images=0), 0, tmp_path)
     assert made.images.shape == (0, 3, 16, 16)
     assert painter.batches == []
+
+
+def test_pictures_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    """Half precision overflows to black pictures; none is kept."""
+    painter = Painter()
+    painter.sample = lambda *a, **k: torch.full((2, 3, 16, 16), float("nan"))  # type: ignore[method-assign]
+    with pytest.raises(NonFiniteError, match="not finite"):
+        make_class_images(painter, PROMPTS, SETTINGS, 0, tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_latents_are_the_encoded_images(prior: StableDiffusion) -> None:

@@ -836,3 +836,39 @@ def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folde
         assert score is not None and score == each.score(x)
         if isinstance(each, Guidance):
             assert each.ensure_precision(x) == 1.0
+
+
+def test_batch_of_terms_and_noises_equals_separate_calls(
+    rng: np.random.Generator, folder: Path
+) -> None:
+    """One sample at a time, the UNet predicts what it predicts in one batch."""
+    x, mask = photo(rng)
+    prior = load_adapted(folder, 0.5)
+    settings = replace(SD_SETTINGS, loss="sds", guidance_scale=7.5)
+    made = Guidance(prior, PROMPT, settings, mask, 10, 3, "scene")
+    together = made.gradient(x, 4)
+    predict = prior.predict
+    sizes = []
+
+    def one_by_one(
+        z: Tensor, t: Tensor, e: Tensor, adapters: Sequence[str | None], *_: None
+    ) -> Tensor:
+        sizes.append(len(z))
+        parts = [slice(i, i + 1) for i in range(len(z))]
+        return torch.cat([predict(z[p], t[p], e[p], adapters[p]) for p in parts])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prior, "predict", one_by_one)
+        separate = made.gradient(x, 4)
+    assert sizes == [4] and together is not None and separate is not None
+    assert compare_gradients(separate, together).relative_l2 < 2e-5  # float32, g = 7.5
+
+
+def test_prompts_are_embedded_once(rng: np.random.Generator) -> None:
+    """Steps and scores use the embeddings of the start: the text encoder may be freed."""
+    prior = GaussianPrior()
+    made = guidance(prior, ASKED)
+    prior.embed = pytest.fail  # type: ignore[assignment]
+    for step in range(3):
+        made.gradient(picture(rng), step)
+    assert made.score(picture(rng)) is not None

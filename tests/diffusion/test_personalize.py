@@ -26,6 +26,7 @@ from warpir.diffusion.personalization.class_images import to_bytes
 from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
+    load_lora,
     lora_parameters,
     remove_lora,
     save_lora,
@@ -663,3 +664,30 @@ def test_the_model_is_shown_before_and_after(epsilon: StableDiffusion, tmp_path:
     again = show_personalization(*arguments, report=lambda stage, *_: told.append(stage))
     assert np.array_equal(again, sheet)
     assert set(told) == {"samples"}
+
+
+@pytest.mark.parametrize("place", [0, 1], ids=["diffusers", "kohya"])
+def test_saved_files_are_the_trained_adapter(
+    prior: StableDiffusion, folders: dict[str, Path], tmp_path: Path, place: int
+) -> None:
+    """In a fresh prior and in diffusers' pipeline, to the bit."""
+    from diffusers import StableDiffusionPipeline
+
+    made = personalize(prior, PHOTO, PROMPTS, SETTINGS, 0, None)
+    kind = prior.schedule.prediction_type
+    file = save_lora(made.lora, tmp_path, 32, kind, PROMPTS.photo)[place]
+    expected = predictions(prior, "scene")
+
+    fresh = load(folders[kind])
+    load_lora(fresh, file)
+    assert torch.equal(predictions(fresh, "scene"), expected)
+
+    pipeline = StableDiffusionPipeline.from_pretrained(
+        folders[kind], safety_checker=None, local_files_only=True
+    )
+    pipeline.load_lora_weights(tmp_path, weight_name=file.name, adapter_name="scene")
+    theirs = load(folders[kind])
+    theirs.unet = pipeline.unet
+    theirs.adapters.add("scene")
+    assert torch.equal(predictions(theirs, "scene"), expected)
+    assert not torch.equal(predictions(theirs, None), expected)
