@@ -4,7 +4,7 @@ const sheet = JSON.parse(document.getElementById("sheet").textContent);
 const by = (id) => document.getElementById(id);
 const pages = ["consent", "instruction", "trial", "last", "stopped"];
 const largestZoom = 8, clickZoom = 3, zoomStep = 1.25, panStep = 0.1;
-// A double click must not answer two pairs.
+// A key that is struck twice must not answer two pairs.
 const deafMs = 400;
 
 // ------------------------------------------------------------------------ what is remembered
@@ -150,8 +150,10 @@ function showPhoto(on) {
   by("photo").hidden = !on;
   by("show-photo").setAttribute("aria-pressed", String(on));
 }
-by("choose-1").addEventListener("click", () => choose(1));
-by("choose-2").addEventListener("click", () => choose(2));
+// The second click of a double click counts as such however long the page was busy in between.
+for (const side of [1, 2]) {
+  by(`choose-${side}`).addEventListener("click", (event) => { if (event.detail < 2) choose(side); });
+}
 by("show-photo").addEventListener("click", () => {
   showPhoto(by("photo").hidden);
   by("photo").scrollIntoView({ block: "nearest" });
