@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -40,6 +41,10 @@ class Worker:
         if self.count == 1:
             yield
             return
+        # The optimiser's first step imports this module, whose default arguments are the group of
+        # that moment. They would keep the group and its threads beyond `destroy_process_group`, and
+        # a thread that frees a tensor while Python ends aborts the process or waits for ever.
+        importlib.import_module("torch.distributed.nn.functional")
         if device.type == "cuda":
             torch.cuda.set_device(device)
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
