@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warpir.kernels.bsdf import F0_COAT, luminance
+from warpir.kernels.bsdf import F0_COAT, luminance, sheen_albedo_at
 from warpir.kernels.maths.fresnel import film_fresnel, schlick
 from warpir.kernels.tracing.hit import Hit
 from warpir.kernels.tracing.texture import (
@@ -116,7 +116,7 @@ def transmitted_share(
     """Return the share of light that passes a thin transmissive wall straight on.
 
     KHR_materials_transmission for a surface of roughness 0, its tint reduced to luminance: what
-    coat and dielectric do not reflect, times the base colour. The angle is that with the
+    coat, sheen and dielectric do not reflect, times the base colour. The angle is that with the
     interpolated normal, so that rays need not read normal maps.
     """
     e = extensions_at(mesh, material, texture, m, hit)
@@ -148,6 +148,9 @@ def transmitted_share(
         film = film_fresnel(own, e.film_ior, e.film_thickness, cos_o)
         reflected = wp.max(bare + (film - bare) * e.iridescence)
     share = e.transmission * (1.0 - metallic) * luminance(tint)
+    if wp.max(e.sheen_color) > 0.0:
+        albedo = sheen_albedo_at(material.sheen_albedo, cos_o, e.sheen_roughness)
+        share *= wp.max(1.0 - wp.max(e.sheen_color) * albedo, 0.0)
     return share * (1.0 - reflected) * (1.0 - coat)
 
 

@@ -14,6 +14,7 @@ from warpir.kernels.tracing.texture import (
     SLOT_METALLIC_ROUGHNESS,
     SLOT_NORMAL,
     sample_texture,
+    slot_difference,
     slot_uv,
 )
 from warpir.kernels.types import ANISOTROPY, Layers, MaterialArgs, MeshArgs, TextureArgs
@@ -55,8 +56,8 @@ def mapped(
     """Apply a normal map of material ``m``, of that strength, to the interpolated normal ``n``.
 
     In the slot of anisotropy, return its direction, or ``n`` where it has none. Tangents come from
-    the asset, or from the triangle's UVs. The map's green axis points to the top of the image,
-    that is against v.
+    the asset, or from the triangle's UVs as the slot transforms them. The map's green axis points
+    to the top of the image, that is against v.
     """
     k = material.slot_texture[m, slot]
     uv_slot = slot
@@ -81,8 +82,8 @@ def mapped(
             uv_c = mesh.uv1[c]
         e1 = mesh.positions[b] - mesh.positions[a]
         e2 = mesh.positions[c] - mesh.positions[a]
-        d1 = uv_b - uv_a
-        d2 = uv_c - uv_a
+        d1 = slot_difference(material, m, uv_slot, uv_b - uv_a)
+        d2 = slot_difference(material, m, uv_slot, uv_c - uv_a)
         det = d1[0] * d2[1] - d1[1] * d2[0]
         if wp.abs(det) < 1.0e-20:
             return n

@@ -82,6 +82,14 @@ def sample_texture(texture: TextureArgs, k: int, uv: wp.vec2, is_color: int) -> 
 
 
 @wp.func
+def slot_difference(material: MaterialArgs, m: int, slot: int, uv: wp.vec2) -> wp.vec2:
+    """Transform a difference of texture coordinates as a slot does: without the shift."""
+    row_u = material.slot_u[m, slot]
+    row_v = material.slot_v[m, slot]
+    return wp.vec2(row_u[0] * uv[0] + row_u[1] * uv[1], row_v[0] * uv[0] + row_v[1] * uv[1])
+
+
+@wp.func
 def slot_uv(mesh: MeshArgs, material: MaterialArgs, m: int, slot: int, hit: Hit) -> wp.vec2:
     """Interpolate and transform the texture coordinates that a slot uses."""
     a = mesh.indices[3 * hit.face]
@@ -91,9 +99,5 @@ def slot_uv(mesh: MeshArgs, material: MaterialArgs, m: int, slot: int, hit: Hit)
     uv = mesh.uv0[a] * hit.u + mesh.uv0[b] * hit.v + mesh.uv0[c] * w
     if material.slot_uv_set[m, slot] == 1:
         uv = mesh.uv1[a] * hit.u + mesh.uv1[b] * hit.v + mesh.uv1[c] * w
-    row_u = material.slot_u[m, slot]
-    row_v = material.slot_v[m, slot]
-    return wp.vec2(
-        row_u[0] * uv[0] + row_u[1] * uv[1] + row_u[2],
-        row_v[0] * uv[0] + row_v[1] * uv[1] + row_v[2],
-    )
+    shift = wp.vec2(material.slot_u[m, slot][2], material.slot_v[m, slot][2])
+    return slot_difference(material, m, slot, uv) + shift

@@ -16,7 +16,7 @@ from warpir.kernels.sampling import (
 )
 from warpir.kernels.types import LightArgs
 from warpir.render.device_light import light_args
-from warpir.scene.light import Light, Lobes
+from warpir.scene.light import Light, Lobes, fibonacci
 
 SAMPLE_COUNT = 200_000
 """Enough to see a fault of 2 % in a cell of 2 % of the mass; a million where marked slow."""
@@ -316,6 +316,21 @@ def test_light_density_integrates_to_one(device: str) -> None:
     d, weight_t, weight_p = on_half_texels(8)
     _, pdf = eval_light(light, d, device)
     assert weight_t @ pdf @ weight_p == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("count", [2, 9, 10, 11, 40])
+@pytest.mark.parametrize("has_map", [False, True], ids=["lobes", "map too"])
+def test_every_part_of_a_light_is_drawn(device: str, count: int, has_map: bool) -> None:
+    """Lobes alike, whose shares all round up: none has probability 0, and all have 1 together."""
+    axes = fibonacci(count).astype(np.float32)
+    lobes = Lobes(np.ones((count, 3), np.float32), axes, np.full(count, 50.0, np.float32))
+    for strongest in (1.0, 3.0):
+        lobes.amplitude[0] = strongest
+        light = light_args(Light(lobes, sun_map() if has_map else None), wp.get_device(device))
+        each = light.lobe_prob.numpy()
+        assert (each > 0.0).all()
+        assert each.sum() + light.map_prob == pytest.approx(1.0, abs=1e-6)
+        assert has_map == (light.map_prob > 0.0)
 
 
 # --------------------------------------------------------------------------------- MIS

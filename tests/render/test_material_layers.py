@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.builders.shapes import box, camera, constant, lobe, placed, quad, sphere
-from tests.oracles import film_fresnel
+from tests.oracles import film_fresnel, sheen_albedo
 from tests.render.test_render import (
     BIAS,
     CARD_VIEW,
@@ -201,6 +201,21 @@ def test_glass_covers_what_it_does_not_let_through(device: str, angle: float) ->
     opaque = render(make(placed(leaning(angle), black), view, device), constant(), 4096)
     share = STANDARD_ERRORS * error / (1.0 - passes)
     assert out.radiance.mean() == pytest.approx(float(opaque.radiance.mean()), rel=share)
+
+
+@pytest.mark.parametrize("angle", [0.0, 60.0, 80.0])
+def test_sheen_lets_through_what_is_below_it(device: str, angle: float) -> None:
+    """What sheen reflects does not pass: a white curtain sends on all light once."""
+    curtain = Material(
+        metallic=0.0, specular=0.0, transmission=1.0, sheen_color=(1.0,) * 3, sheen_roughness=1.0
+    )
+    view, spp = camera(4, 4, 4000.0), 4096
+    out = render(make(placed(leaning(angle), curtain), view, device), constant(), spp)
+    reflected = min(sheen_albedo(float(np.cos(np.radians(angle))), 1.0), 1.0)
+    error = np.sqrt(reflected * (1.0 - reflected) / (spp * 16))
+    # The table that kernels read is right to a percent.
+    assert abs(out.mask.mean() - reflected) < STANDARD_ERRORS * error + 0.01
+    assert out.radiance.mean() - out.mask.mean() == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("angle", [0.0, 60.0])

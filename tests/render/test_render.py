@@ -890,6 +890,28 @@ def test_normal_map_tilts_along_its_texture(device: str, given: bool, flip: floa
         np.testing.assert_allclose(seen, np.tile(expected, (len(seen), 1)), atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "transform",
+    [(0.0, 1.0, 0.2, -1.0, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0, 1.0, 0.0), TURN],
+    ids=["quarter", "mirrored", "turn"],
+)
+def test_normal_map_turns_with_its_texture(device: str, transform: tuple[float, ...]) -> None:
+    """KHR_texture_transform tilts normals as the same coordinates in the mesh do."""
+    plain = quad((0, 0, -5.0), (1, 0, 0), (0, 1, 0))
+    assert plain.uv0 is not None
+    turned = plain.uv0 @ np.reshape(transform, (2, 3))[:, :2].T
+    baked = replace(plain, uv0=turned.astype(np.float32))
+    texture = Texture(np.full((1, 1, 4), (230, 180, 220, 255), np.uint8))
+    slot = TextureSlot(0, transform=transform)  # type: ignore[arg-type]
+    seen, expected = (
+        make(
+            placed(shape, Material(normal_texture=how), textures=(texture,)), CARD_VIEW, device
+        ).gbuffer(0).normal
+        for shape, how in ((plain, slot), (baked, TextureSlot(0)))
+    )  # fmt: skip
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
 def test_mirrored_instance_is_its_mirrored_truth(device: str) -> None:
     """An asset placed with a negative determinant equals one whose mesh was mirrored by hand."""
     ball = sphere((0.4, 0.0, 0.0), 0.6, 3)

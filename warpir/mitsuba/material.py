@@ -143,7 +143,7 @@ class GltfBSDF(mi.BSDF):
             turned[:, 3] *= np.sign(np.linalg.det(linear))
             self.vertex_tangents = _uploaded(turned.astype(np.float32))
         elif mapped is not None:
-            self.face_tangents = _uploaded(face_tangents(primitive, mapped.uv_set, linear))
+            self.face_tangents = _uploaded(face_tangents(primitive, mapped, linear))
 
     def sample(
         self,

@@ -62,7 +62,7 @@ def _wrap(i: mi.Int32, size: int, mode: str) -> mi.Int32:
 
 
 def face_tangents(
-    primitive: Primitive, uv_set: int, linear: NDArray[np.float64]
+    primitive: Primitive, slot: TextureSlot, linear: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """World tangent and handedness of each triangle from its texture coordinates.
 
@@ -71,7 +71,7 @@ def face_tangents(
 
     Args:
         primitive: Triangles, asset frame.
-        uv_set: 0 or 1.
+        slot: Whose texture coordinates count, as it transforms them.
         linear: Asset-to-world linear part, shape [3, 3].
 
     Returns:
@@ -80,11 +80,11 @@ def face_tangents(
     """
     indices = wound(primitive, linear)
     tangents = np.zeros((len(indices), 4), dtype=np.float32)
-    uv = (primitive.uv0, primitive.uv1)[uv_set]
+    uv = (primitive.uv0, primitive.uv1)[slot.uv_set]
     if uv is None:
         return tangents
     p = (primitive.positions @ linear.T)[indices]
-    st = uv.astype(np.float64)[indices]
+    st = (uv.astype(np.float64) @ np.reshape(slot.transform, (2, 3))[:, :2].T)[indices]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     s1, s2 = st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]
     det = s1[:, 0] * s2[:, 1] - s2[:, 0] * s1[:, 1]

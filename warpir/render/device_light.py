@@ -119,7 +119,9 @@ def _stratified(flux: Float64Array) -> Float64Array:
     shares = np.append(share[is_strong], share[~is_strong].sum())
     root = np.sqrt(shares)
     slots = np.maximum(np.round(STRATA * root / root.sum()), shares > 0.0)
-    slots[np.argmax(slots)] += STRATA - slots.sum()
+    slots[np.argmax(slots)] += max(STRATA - slots.sum(), 0.0)
+    while slots.sum() > STRATA:  # one at a time, so that each part keeps one
+        slots[np.argmax(slots)] -= 1.0
     prob = share / max(shares[-1], 1e-300) * slots[-1] / STRATA
     prob[is_strong] = slots[:-1] / STRATA
     return np.asarray(prob)

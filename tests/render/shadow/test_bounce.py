@@ -114,6 +114,21 @@ def test_bounce_of_what_glows(device: str, normal: tuple[float, float, float]) -
     assert_zero(found.thrown - glow * sky.blocked)
 
 
+@pytest.mark.parametrize("sunk", [0.45, 0.9])
+def test_bounce_of_what_is_sunk_is_that_of_what_stands_out(device: str, sunk: float) -> None:
+    """The ground sees the part above it alone: no light that is thrown or blocked is missed."""
+    standing = 1.0 - sunk
+    glows = Material(emission=(1.0, 1.0, 1.0))
+    shapes = (
+        box((0.0, 0.5 - sunk, -4.0), (1.0, 1.0, 1.0)),
+        box((0.0, 0.5 * standing, -4.0), (1.0, standing, 1.0)),
+    )
+    whole, upper = (Runs(placed(shape, glows), constant(), 1, device) for shape in shapes)
+    assert upper.thrown.mean(0).max() > 0.02
+    assert_zero(whole.thrown - upper.thrown)
+    assert_zero(whole.blocked - upper.blocked)
+
+
 def test_bounce_of_a_sunlit_wall_exceeds_one(device: str) -> None:
     """Before a Lambert wall in the sun the ground gains; behind it, in its shadow, nothing."""
     axis, sharpness = np.array([0.2, 0.45, 0.9]), 300.0
