@@ -774,3 +774,21 @@ def test_solid_glass_keeps_its_materials(what: str) -> None:
     assert len(problems) == (what != "tone")
     for problem in problems:
         assert problem.code == ExitCode.USAGE and "'pane'" in str(problem)
+
+
+def test_thin_glass_keeps_what_decides_what_passes_it() -> None:
+    """Its base colour and metallic have no gradient; other materials and its roughness do."""
+    materials = (Material(name="paint"), Material(name="window", transmission=1.0))
+    given = {"photo": "road.jpg", "asset": "car.glb", "sky": "overcast", "model": "sd"}
+
+    def refused(refine: str, **changes: Any) -> list[str]:
+        config = InsertConfig().changed(**given, prompt="a car", refine=refine, **changes)
+        problems = refused_refinement(config, Asset("car", (), materials))
+        return [str(problem) for problem in problems if problem.code == ExitCode.USAGE]
+
+    (told,) = refused("material")
+    assert "no base color" in told and "'window'" in told
+    assert refused("material", refine_parts=("roughness", "metallic"))
+    assert not refused("material", refine_materials=("paint",))
+    assert not refused("material", refine_parts=("roughness",))
+    assert not refused("emission") and not refused("tone")

@@ -418,3 +418,12 @@ def refused_refinement(config: InsertConfig, asset: "Asset") -> Iterator[InputEr
                 what = f"cannot be used with the solid glass {m.name[:60]!a} in the object"
                 yield usage("--refine", what, "leave one of them out")
                 return
+    if config.task.refine == "material" and config.task.refine_parts != ("roughness",):
+        for index in asset.materials_named(config.task.refine_materials):
+            m = asset.materials[index]
+            if m.transmission > 0.0:
+                # Both change which rays pass a thin wall, and a decision has no derivative.
+                what = f"changes no base color and no metallic of the thin glass {m.name[:60]!a}"
+                advice = "name other materials by --refine-materials, or --refine-parts roughness"
+                yield usage("--refine", what, advice)
+                return

@@ -334,6 +334,9 @@ class GltfBSDF(mi.BSDF):
         cosine = dr.abs(dr.dot(si.sh_frame.n, wo))
         enters = 1.0 - dr.max(surface.reflectance(cosine)[0])
         enters *= 1.0 - clearcoat * (0.04 + 0.96 * schlick_weight(cosine))
+        if self.sheen_table is not None:
+            E = read_sheen_table(self.sheen_table, cosine, sheen_roughness)
+            enters *= 1.0 - dr.max(sheen) * E
         passes = surface.transmission * (1.0 - metallic) * mi.luminance(base_color) * enters
         surface.stopped = 1.0 - passes
         return surface
