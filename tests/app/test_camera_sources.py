@@ -1,6 +1,7 @@
 """Where the numbers of a photo's camera come from: flags, EXIF, a file, an estimate."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.core.arrays import FloatArray
 from warpir.core.errors import InputError
+from warpir.report.remedies import remedies
 from warpir.scene.camera import CameraEstimate, camera_from_fov, ground_point
 
 WIDTH, HEIGHT = 96, 64
@@ -298,3 +300,44 @@ def test_asked_size_is_kept(folder: Path) -> None:
     inputs = read(folder, Asked(), size=0.02)
     scale = np.linalg.norm(inputs.placement.asset_to_world[:3, 0])
     assert scale * 0.5 == pytest.approx(0.02)
+
+
+def test_object_that_is_placed_keeps_its_size_and_is_said_to_be_tiny(folder: Path) -> None:
+    """A speck is no result that anyone wants unknowingly; who asked for its size knows it."""
+    at = (0.5 * WIDTH, 0.6 * HEIGHT)
+    small = read(folder, Asked(), at=at, scale=0.02)
+    assert not any("pixels long" in line for line in small.notices)
+    trimesh.creation.box(extents=(0.02, 0.02, 0.02)).export(folder / "speck.glb")
+    speck = read(folder, Asked(), asset=folder / "speck.glb", at=at)
+    assert any("with its own 0.02 m the object is" in line for line in speck.notices)
+    assert np.linalg.norm(speck.placement.asset_to_world[:3, 0]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("extent", [0.02, 40.0], ids=["speck", "house"])
+def test_remedies_keep_what_was_found_of_place_and_size(folder: Path, extent: float) -> None:
+    """The report's commands change one thing: not the size with the place, nor the reverse."""
+    file = folder / f"{extent}.glb"
+    trimesh.creation.box(extents=(extent, 0.6 * extent, 0.5 * extent)).export(file)
+
+    def placed(**changes: Any) -> tuple[InsertConfig, dict[str, Any]]:
+        inputs = read(folder, Asked(), asset=file, **changes)
+        record = inputs.placement.record(*inputs.asset.bounds(), inputs.camera, 0.0)
+        return InsertConfig(photo="photo.png", asset=str(file)), record
+
+    config, first = placed()
+    light = {"azimuth_deg": 0.0, "elevation_deg": 45.0}
+    measured = {"light": light, "exposure_ev": 0.0, "samples": 40, "placement": first}
+    told_of = remedies(config, {"measured": measured}, None)
+    found = {remedy.fault: shlex.split(remedy.command) for remedy in told_of}
+
+    def told(fault: str) -> dict[str, Any]:
+        words = found[fault]
+        at = tuple(float(x) for x in words[words.index("--at") + 1].split(","))
+        return {"at": at, "scale": float(words[words.index("--scale") + 1])}
+
+    again = placed(**told("It stands in the wrong place"))[1]
+    assert again["at"] == first["at"]
+    assert again["scale"] == pytest.approx(first["scale"], rel=1e-3)
+    larger = placed(**told("It is too small or too large"))[1]
+    assert larger["at"] == first["at"]
+    assert larger["scale"] == pytest.approx(1.2 * first["scale"], rel=1e-2)

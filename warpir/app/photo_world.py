@@ -338,14 +338,19 @@ def stand_on_ground(
             is_plane=is_plane,
         )
 
+    is_sized = asked.size is not None or asked.scale is not None
     if world.place is None and asked.at is None:
-        is_sized = asked.size is not None or asked.scale is not None
         placement = _set_free(put, asset, world, mesh, is_sized)
     else:
         placement = put(world.place)
         stand = Stand(placement.asset_to_world, low, high, world.camera)
         if world.cloud is not None and (count := len(stand.points_in_way(world.cloud))):
             warning = f"{count} points of --ground-points stand where the object does; is it free?"
+            placement = replace(placement, warnings=(*placement.warnings, warning))
+        if not is_sized and stand.share_of_height < SEEN[0]:
+            pixels = stand.share_of_height * world.camera.height
+            metres = float((high - low).max())
+            warning = f"with its own {metres:.3g} m the object is {pixels:.2g} pixels long (--size)"
             placement = replace(placement, warnings=(*placement.warnings, warning))
     return settled(
         placement,
@@ -408,7 +413,7 @@ def _set_free(
             f"the object is {size:g} m large, since with its own {float((high - low).max()):.3g} m "
             f"it would be {'hardly seen' if seen < SHOWN else 'cut'} (--size, --scale)"
         )
-    shown = ",".join(f"{x:.3g}" for x in place)
+    shown = ",".join(f"{round(x, 3) + 0.0:.3g}" for x in place)
     why = "it is seen whole" if world.cloud is None else "no points are in its way"
     lines.append(f"the object stands at {shown}, where {why} (--at, --place)")
     return replace(placement, assumed=(*placement.assumed, *lines))

@@ -147,9 +147,7 @@ def report_page(results: Results, is_beside: bool = True) -> bytes:
         ],
         figures=figures(record),
         **_clock(record),
-        remedies=remedies(
-            config, record, results.layers.matte > 0.0 if results.layers is not None else None
-        ),
+        remedies=remedies(config, record, results.camera),
         command_by_record=again(asked),
         command_by_flags=command_line(asked),
         settings=settings(asked, record),

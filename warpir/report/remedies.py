@@ -8,15 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from warpir.app.command import BY_HAND
 from warpir.app.config import InsertConfig, flag
-from warpir.core.arrays import BoolArray
 from warpir.report.facts import in_words
-
-TRIAL_FOV = 65.0
-"""Horizontal field of view of a phone's main camera, a value to try [deg]."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +33,21 @@ def again(asked: Mapping[str, Any], **changes: Any) -> str:
 
 
 def remedies(
-    config: InsertConfig, record: Mapping[str, Any], matte: BoolArray | None
+    config: InsertConfig, record: Mapping[str, Any], camera: Mapping[str, Any] | None
 ) -> list[Remedy]:
     """Return what can be changed in a run, each with a value near the run's own.
 
     Args:
         config: Of the run.
         record: Content of its ``run.json``.
-        matte: Where the object is seen, shape [H, W]; None where that is not known.
+        camera: Content of its ``camera.json``; None where that is gone.
     """
     asked, measured = config.flat(), record["measured"]
     samples = measured.get("samples", asked["samples"])  # older records state the asked number
     found = [] if config.is_guided else [*_light(asked, measured)]
     if asked["camera"] is None and not asked["demo"]:
-        found += _camera(asked, measured)
-    found += _placement(asked, measured, matte)
+        found += _camera(asked, measured, camera)
+    found += _placement(asked, measured["placement"])
     found += [
         Remedy(
             "Something in the photo should stand before the object",
@@ -97,7 +91,9 @@ def _light(asked: Mapping[str, Any], measured: Mapping[str, Any]) -> Iterator[Re
     )
 
 
-def _camera(asked: Mapping[str, Any], measured: Mapping[str, Any]) -> Iterator[Remedy]:
+def _camera(
+    asked: Mapping[str, Any], measured: Mapping[str, Any], camera: Mapping[str, Any] | None
+) -> Iterator[Remedy]:
     numbers = measured.get("camera", {})
     if "pitch_deg" not in numbers or "vfov_deg" not in numbers:
         return
@@ -114,37 +110,37 @@ def _camera(asked: Mapping[str, Any], measured: Mapping[str, Any]) -> Iterator[R
     else:
         about = f"up from the level [degrees]; here {pitch['value']:.1f}"
         yield Remedy(fault, again(asked, pitch=pitch["value"] + 3.0), about)
-    about = f"horizontal field of view [degrees]; vertically this run has {vfov['value']:.0f}"
-    yield Remedy(
-        "Near and far parts of it are in the wrong proportion",
-        again(asked, fov=asked["fov"] or TRIAL_FOV),
-        about,
-    )
+    if camera is not None:
+        fov = math.degrees(2.0 * math.atan(camera["w"] / 2.0 / camera["fx"]))
+        about = f"horizontal field of view [degrees]; here {fov:.1f}"
+        fault = "Near and far parts of it are in the wrong proportion"
+        yield Remedy(fault, again(asked, fov=round(min(1.2 * fov, 120.0), 1)), about)
 
 
-def _placement(
-    asked: Mapping[str, Any], measured: Mapping[str, Any], matte: BoolArray | None
-) -> Iterator[Remedy]:
+def _placement(asked: Mapping[str, Any], placed: Mapping[str, Any]) -> Iterator[Remedy]:
+    # Where an object stands that was not placed, and how large it is then, follow from each other:
+    # what shall stay is told.
+    is_placed = any(asked[name] is not None for name in ("place", "at")) or asked["demo"]
+    is_sized = any(asked[name] is not None for name in ("size", "scale"))
+    at = {} if is_placed or placed.get("at") is None else {"at": tuple(placed["at"])}
+    scale = {} if is_placed or is_sized or not at else {"scale": float(f"{placed['scale']:.4g}")}
+    fault = "It stands in the wrong place"
     if asked["place"] is not None:
         about = "x, y, z of the ground under the object [metres]"
-        yield Remedy("It stands in the wrong place", again(asked, place=asked["place"]), about)
-    else:
-        at = asked["at"]
-        if at is None and matte is not None and matte.any():
-            rows, columns = np.nonzero(matte)
-            at = (round(float(columns.mean())), int(rows.max()))
-        if at is not None and not asked["demo"]:
-            about = "the photo's pixel of the ground on which it stands, from the top left"
-            yield Remedy("It stands in the wrong place", again(asked, at=at), about)
+        yield Remedy(fault, again(asked, place=asked["place"]), about)
+    elif asked["at"] is not None or at:
+        about = "the photo's pixel of the ground on which it stands, from the top left"
+        yield Remedy(fault, again(asked, **{"at": asked["at"]} | at, **scale), about)
     turn = asked["rotate_y"] or 0.0
     about = f"counter-clockwise as seen from above [degrees]; here {turn:g}"
-    yield Remedy("It looks the wrong way", again(asked, rotate_y=turn + 45.0), about)
+    fault = "It looks the wrong way"
+    yield Remedy(fault, again(asked, rotate_y=turn + 45.0, **at, **scale), about)
+    fault = "It is too small or too large"
     if asked["size"] is not None:
         size = float(f"{1.2 * asked['size']:.3g}")
         about = f"its longest side [metres]; here {asked['size']:g}"
-        yield Remedy("It is too small or too large", again(asked, size=size), about)
-    elif "scale" in measured["placement"]:
-        scale = measured["placement"]["scale"]
-        about = f"factor on the file's own size; here {scale:.3g}"
-        value = float(f"{1.2 * scale:.3g}")
-        yield Remedy("It is too small or too large", again(asked, scale=value), about)
+        yield Remedy(fault, again(asked, size=size, **at), about)
+    elif "scale" in placed:
+        about = f"factor on the file's own size; here {placed['scale']:.3g}"
+        value = float(f"{1.2 * placed['scale']:.3g}")
+        yield Remedy(fault, again(asked, scale=value, **at), about)

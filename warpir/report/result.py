@@ -388,11 +388,9 @@ def _measured(run: Run, light: SceneLight, summary: LightSummary) -> dict[str, A
     measured: dict[str, Any] = {
         "prior": "none",
         "integrator": "mis",
-        "placement": {
-            "summary": inputs.placement.summary,
-            "scale": float(np.linalg.norm(inputs.placement.asset_to_world[:3, 0])),
-            "ground": inputs.placement.ground.tolist(),
-        },
+        "placement": inputs.placement.record(
+            *inputs.asset.bounds(), inputs.camera, run.config.placement.sink
+        ),
         "exposure_ev": light.exposure,
         "light": asdict(summary),
         "lobe_fit": fit

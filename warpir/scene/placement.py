@@ -7,6 +7,7 @@ centre of its footprint, since an asset's origin can be anywhere.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +47,26 @@ class Placement:
     """Doubtful values, one line each."""
     summary: str = ""
     """Distance, size and position in the photo of the object, one line."""
+
+    def record(
+        self, low: Float64Array, high: Float64Array, camera: Camera, sink: float
+    ) -> dict[str, Any]:
+        """Return the entry of ``run.json``; ``at`` is the pixel that ``--at`` takes back.
+
+        Args:
+            low: Lowest corner of the asset, asset frame [m], shape [3].
+            high: Highest corner.
+            camera: Camera of the photo.
+            sink: How deep the object was sunk [m].
+        """
+        stand = self.asset_to_world[:3, :3] @ _foot(low, high) + self.asset_to_world[:3, 3]
+        (at,) = camera.project((stand + sink * self.ground[:3])[None])
+        return {
+            "summary": self.summary,
+            "scale": float(np.linalg.norm(self.asset_to_world[:3, 0])),
+            "ground": self.ground.tolist(),
+            "at": np.round(at, 1).tolist() if np.isfinite(at).all() else None,
+        }
 
 
 def place_asset(
@@ -191,11 +212,15 @@ def _standing(
     low: Float64Array, high: Float64Array, scale: float, rotation: Float64Array, stand: Float64Array
 ) -> Float64Array:
     """Return the matrix that puts the centre of a bounding box's lowest face at a point."""
-    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
     asset_to_world = np.eye(4)
     asset_to_world[:3, :3] = scale * rotation
-    asset_to_world[:3, 3] = stand - scale * (rotation @ foot)
+    asset_to_world[:3, 3] = stand - scale * (rotation @ _foot(low, high))
     return asset_to_world
+
+
+def _foot(low: Float64Array, high: Float64Array) -> Float64Array:
+    """Return the centre of a bounding box's lowest face, shape [3]."""
+    return np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
 
 
 def _scale_of(
