@@ -5,9 +5,18 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 from scipy import ndimage
 
-from tests.builders.insertions import arguments, go, read_image, read_layers, record_of, untouched
+from tests.builders.insertions import (
+    arguments,
+    go,
+    read_image,
+    read_layers,
+    record_of,
+    rgb,
+    untouched,
+)
 from tests.builders.outcome import outcome
 from warpir.look.camera_look import CameraLook
 
@@ -69,3 +78,28 @@ def test_all_off_gives_the_bytes_of_a_run_without_the_stage(
         assert 2000 < same.sum() < same.size - 500
         np.testing.assert_array_equal(codes[same], before[same])
     assert (codes != auto.image()).any(axis=-1).sum() > 500
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+def test_black_and_white_photo_has_a_grey_object(
+    inputs: Path, tmp_path: Path, device: str, kind: str
+) -> None:
+    """Object, shadow and grain have no colour, in picture and layers, unless that is asked for."""
+    colored, photo = tmp_path / "colored.png", tmp_path / f"photo.{kind}"
+    write_photographed(colored, 8)
+    Image.open(colored).convert("L").save(photo)
+    lamp = {"light": None, "sun": "40,30", "sky": "clear"}
+    (tmp_path / "grey").mkdir()
+    words = {"photo": str(photo), "device": device, **lamp}
+    grey = go(arguments(inputs, tmp_path / "grey" / "out", **words), tmp_path / "grey" / "out")
+    assert grey.record["measured"]["look"]["grey"] is True
+    assert any("black and white" in line for line in grey.record["assumed"])
+    assert np.ptp(grey.image().astype(int), axis=-1).max() == 0
+    planes = read_layers(tmp_path / "grey" / "out" / "layers.exr")
+    for name in ("fg", "specular", "shadow", "grain"):
+        layer = rgb(planes, f"{name}.")
+        assert np.ptp(layer, axis=-1).max() == 0.0 and np.ptp(layer) > 0.0, name
+    (tmp_path / "off").mkdir()
+    off = tmp_path / "off" / "out"
+    colored_run = go(arguments(inputs, off, **words, response="off"), off)
+    assert np.ptp(colored_run.image().astype(int), axis=-1).max() > 20

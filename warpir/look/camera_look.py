@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, in_bands
-from warpir.core.color import GAMMA
+from warpir.core.color import GAMMA, luminance
 from warpir.io.images.jpeg import JpegCoding
 from warpir.look.grain import Grain, as_told, blocks_over, estimate_grain, grain_over
 from warpir.look.response import PLACED, Response, estimate_response
@@ -33,6 +33,8 @@ class CameraLook:
     grain: Grain | None = None
     response: Response | None = None
     jpeg: JpegCoding | None = None
+    is_grey: bool = False
+    """Whether the photo is black and white, and so are object and shadow."""
 
     def blur_to_add(self, enlarged: float = 1.0) -> float:
         """Return the Gaussian that a rendered object lacks [px].
@@ -100,6 +102,13 @@ class CameraLook:
         bent = response.shadow_ratio(ratio, plate[shaded])
         planes["shadow_ratio"][shaded] = np.where(ratio == 1.0, ratio, bent)
 
+    def coloured_like_photo(self, planes: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return the planes of `shown_like_photo`, and ``mirror``, grey if the photo is."""
+        if not self.is_grey:
+            return planes
+        names = {*SUMMED, "shadow_ratio", "mirror"} & planes.keys()
+        return planes | {name: _as_grey(planes[name]) for name in names}
+
     def grain_on(
         self,
         composite: FloatArray,
@@ -117,11 +126,13 @@ class CameraLook:
         if self.jpeg is not None:
             blocks = blocks_over(self.jpeg, composite, changed, gamma)
             added = blocks if added is None else added + blocks
-        return added
+        return _as_grey(added) if self.is_grey and added is not None else added
 
     def lines(self) -> list[str]:
         """Return what was estimated, a sentence each."""
         found = []
+        if self.is_grey:
+            found.append("the photo is black and white, and so is the object (--response off: not)")
         if self.response is not None:
             black = 255.0 * self.response.dark(np.array(PLACED[0])) ** (1.0 / GAMMA)
             found.append(
@@ -153,7 +164,19 @@ class CameraLook:
             "grain": None if self.grain is None else asdict(self.grain),
             **({} if self.response is None else {"response": asdict(self.response)}),
             **({} if self.jpeg is None else {"jpeg": {"quality": self.jpeg.quality}}),
+            **({"grey": True} if self.is_grey else {}),
         }
+
+
+def is_black_and_white(srgb: AnyFloatArray) -> bool:
+    """Return whether a photo, shape [H, W, 3], has equal channels everywhere, and is no flat."""
+    return bool((srgb == srgb[..., :1]).all() and (srgb != srgb[0, 0]).any())
+
+
+def _as_grey(plane: FloatArray) -> FloatArray:
+    """Return a plane's luminance in all channels; what is grey stays to the bit; [H, W, 3]."""
+    grey = np.asarray(luminance(plane), np.float32)[..., None]
+    return np.where((plane == plane[..., :1]).all(axis=-1, keepdims=True), plane, grey)
 
 
 def estimate_look(

@@ -19,7 +19,12 @@ from warpir.io.layers import write_layers
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
-from warpir.look.camera_look import CameraLook, estimate_look, region_around
+from warpir.look.camera_look import (
+    CameraLook,
+    estimate_look,
+    is_black_and_white,
+    region_around,
+)
 from warpir.look.denoise import denoiser_version
 from warpir.render.composite import UNCHANGED, Picture, make_picture
 from warpir.render.picture.light_preview import balls
@@ -133,7 +138,9 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
         response = "off"
     words = asked.sharpness, asked.grain, response
     look = estimate_look(photo.srgb, photo.linear(), around, *words, photo.jpeg)
-    if "auto" in words:
+    if asked.response != "off":
+        look = replace(look, is_grey=is_black_and_white(photo.srgb))
+    if "auto" in words or look.is_grey:
         run.log.assume(*look.lines())
     return look
 
