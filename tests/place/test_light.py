@@ -11,9 +11,9 @@ from PIL import Image
 from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import STATE, command, enter, placing, press, save, settle
 from warpir.core.errors import InputError
-from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regression import CLEAR_DEG, Regression, regress
 from warpir.lighting.regressor import load_regressor
-from warpir.place.work import CLEAR_DEG, light_record
+from warpir.place.work import light_record
 from warpir.place.worker import Worker
 from warpir.scene.camera import camera_from_fov
 

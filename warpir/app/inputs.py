@@ -322,6 +322,10 @@ def _notices(
     if config.camera.proxy and files.proxy:
         yield from _about(config.camera.proxy, files.proxy.notices)
     yield from files.log.notices
+    if not config.is_guided and config.guidance.prompt:
+        yield "--prompt: nothing reads it without --model"
+    if not config.is_guided and config.optimize.steps:
+        yield "--steps: there are none without --model"
     if config.camera.undistort and files.view.lens.is_straight:
         yield "--undistort: the camera has no distortion, nothing was undone"
     yield from camera.notices

@@ -85,9 +85,10 @@ def _describe_direction(regression: Regression) -> str:
             "as suns in view are; all other light is what the regressor sees in the photo "
             "(--no-visible-sun, --sun, --light)"
         )
+    where = "mainly from" if regression.is_clear else "from no clear direction, perhaps mainly from"
     return (
-        "the light is what the regressor sees in the photo: mainly from azimuth "
-        f"{azimuth:.0f}, elevation {elevation:.0f}, +- {regression.spread_deg:.0f} degrees "
+        f"the light is what the regressor sees in the photo: {where} azimuth "
+        f"{round(azimuth)}, elevation {round(elevation)}, +- {regression.spread_deg:.0f} degrees "
         "(--light, --sun, --sky)"
     )
 

@@ -31,6 +31,10 @@ LOG_STD_MIN, LOG_STD_MAX = 0.1, 0.7
 greatest one, guidance puts out a sun that the regressor is not sure of, for soft light is never
 quite wrong."""
 
+CLEAR_DEG = 40.0
+"""Expected angle to the truth up to which a direction of the light counts as seen [deg]: that of a
+network that sees nothing is 65, an even distribution over its directions."""
+
 
 @dataclass(frozen=True)
 class Regression:
@@ -86,6 +90,11 @@ class Regression:
         cosine = float(np.maximum(self.directions @ normal, 0.0) @ self.probability)
         rest: Float64Array = Light(lobes=self.ambient).irradiance(normal)
         return cosine * self.sun + rest
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the photo shows where the light comes from (`CLEAR_DEG`)."""
+        return self.spread_deg <= CLEAR_DEG
 
     def record(self) -> dict[str, Any]:
         """Return plain values for ``run.json``."""

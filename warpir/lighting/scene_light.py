@@ -134,6 +134,8 @@ def _described(asked: LightConfig, assumed: list[str]) -> Light:
     """Return the sun and sky of the flags."""
     sun, sky = asked.sun, asked.sky
     preset = sky if isinstance(sky, str) else "clear"
+    if sky is None:
+        assumed.append("the sky round the sun of --sun is clear (--sky)")
     sky_color, sun_color = SKIES[preset]
     if isinstance(sky, tuple):
         sky_color = sky

@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from warpir.lighting.scene_light import SceneLight
     from warpir.render.renderer import Renderer
 
-CLEAR_DEG = 40.0
-"""Expected angle to the truth up to which a direction of the light counts as seen [deg]: that of a
-network that sees nothing is 65, an even distribution over its directions."""
-
 PREVIEW_SAMPLES, PREVIEW_DEPTH, PREVIEW_LIMIT = 12, 3, 8.0
 """Samples per pixel, longest light path, and most radiance after its first bounce of a preview."""
 PREVIEW_ROWS = 160
@@ -159,10 +155,10 @@ def light_record(found: Regression) -> dict[str, Any]:
     """Return an estimated light as the page shows it, plain values.
 
     Irradiances and radiances are linear RGB in the photo's unit; of a light without a clear
-    direction (`CLEAR_DEG`) the direction is None, and its irradiance is spread as the estimate's
-    probability is.
+    direction (`Regression.is_clear`) the direction is None, and its irradiance is spread as the
+    estimate's probability is.
     """
-    is_clear = found.spread_deg <= CLEAR_DEG
+    is_clear = found.is_clear
     rest = replace(found, sun=np.zeros(3)) if is_clear else found
     up = np.array([0.0, 1.0, 0.0])
     above, below = (rest.irradiance(normal) / math.pi for normal in (up, -up))

@@ -22,6 +22,7 @@ from warpir.core.limits import LIMITS
 from warpir.core.strict_json import read_json_object
 from warpir.io.layers import Layers
 from warpir.io.results import OutputFolder
+from warpir.lighting.regression import CLEAR_DEG
 from warpir.report.facts import (
     about_file,
     camera_sources,
@@ -176,6 +177,9 @@ def _lead(results: Results) -> str:
     parts = [measured["placement"]["summary"]] if "placement" in measured else []
     if results.character is not None:
         parts.append(f"The light comes {origin_words(results.character)}")
+        spread = measured.get("regression", {}).get("spread_deg", 0.0)
+        if spread > CLEAR_DEG:
+            parts[-1] += f", by an estimate that is unsure of it (± {spread:.0f} degrees)"
     return ". ".join(part[:1].upper() + part[1:] for part in parts) + ("." if parts else "")
 
 

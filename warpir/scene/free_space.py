@@ -160,7 +160,7 @@ def find_place(
     Raises:
         InputError: Every place is occupied or hidden, or the photo shows no ground.
     """
-    candidates = _candidates(put, camera, plane)
+    candidates, is_ground_seen = _candidates(put, camera, plane)
     fallback: tuple[int, Place] | None = None
     for _, place, stand in candidates:
         rank = 2 * stand.is_cut
@@ -172,12 +172,12 @@ def find_place(
             return place
         if fallback is None or rank < fallback[0]:
             fallback = rank, place
+    if not candidates and is_ground_seen:
+        what = "the object reaches the camera wherever on the ground in view it stands"
+        raise InputError("--size", what, "give less")
     if fallback is None and cloud is None:
-        raise InputError(
-            "--at",
-            "the photo shows no ground on which the object could stand",
-            "give --horizon and --fov, or --at",
-        )
+        what = "the photo shows no ground on which the object could stand"
+        raise InputError("--horizon", what, "give another, or --pitch, or place the object by --at")
     if fallback is None:
         raise InputError(
             "--ground-points",
@@ -189,13 +189,15 @@ def find_place(
 
 def _candidates(
     put: Callable[[Place], Stand], camera: Camera, plane: Float64Array
-) -> list[tuple[float, Place, Stand]]:
-    """Return (cost, place, stand) on a grid over the photo, cheapest first."""
+) -> tuple[list[tuple[float, Place, Stand]], bool]:
+    """Return (cost, place, stand) over a grid, cheapest first, and whether ground is in view."""
     found: list[tuple[float, Place, Stand]] = []
+    is_ground_seen = False
     for v in (np.arange(GRID[1]) + 0.5) / GRID[1]:
         for u in (np.arange(GRID[0]) + 0.5) / GRID[0]:
             try:
                 point = point_on_ground((u * camera.width, v * camera.height), camera, plane)
+                is_ground_seen = True
                 place = (float(point[0]), float(point[1]), float(point[2]))
                 stand = put(place)
             except InputError:
@@ -204,4 +206,4 @@ def _candidates(
             off = max(np.log(NEAR / sides), np.log(sides / FAR), 0.0)
             cost = float(np.hypot(u - DEFAULT_STAND[0], v - DEFAULT_STAND[1]) + off)
             found.append((cost, place, stand))
-    return sorted(found, key=lambda entry: entry[0])
+    return sorted(found, key=lambda entry: entry[0]), is_ground_seen

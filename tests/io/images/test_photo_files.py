@@ -517,6 +517,7 @@ def test_i12_what_is_not_followed_is_noted(tmp_path: Path) -> None:
     path = str(tmp_path / "p.exr")
     for header, words in (
         ({"pixelAspectRatio": 2.0}, "pixel aspect ratio 2"),
+        ({"displayWindow": (np.array([1, 0], np.int32), np.array([3, 3], np.int32))}, "overscan"),
         ({"colorInteropID": "lin_of_mine"}, "lin_of_mine is not followed"),
         ({"chromaticities": (0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3)}, "broken"),
     ):
