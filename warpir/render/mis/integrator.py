@@ -30,6 +30,8 @@ LAMP_SEED = 0x1A3B5
 class MisIntegrator:
     """Unbiased for the light it is handed; gradients to light, lamps, materials and emission.
 
+    Those to base colour and metallic of thin glass leave out what passes it, which is a decision.
+
     Args:
         renderer: The scene to render.
         object_pixels: Row-major pixels that may show the object, shape [object_pixel].
