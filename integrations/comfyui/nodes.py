@@ -192,11 +192,14 @@ class InsertObject:
         values["out"] = str(folder / "result")
         if at_x >= 0.0 and at_y >= 0.0:
             values["at"] = (at_x * photo.shape[1], at_y * photo.shape[0])
-        if occluder is not None:
+        # A photo without alpha has an empty mask, of no particular size.
+        if occluder is not None and bool(occluder.any()):
             share = occluder.reshape(-1, *occluder.shape[-2:])[0].cpu().numpy()
             Image.fromarray(np.uint8(np.round(share * 255.0))).save(folder / "occluder.png")
             values["occluder_mask"] = str(folder / "occluder.png")
-        found = insert(InsertConfig(**values))
+        # ComfyUI runs nodes without derivatives, and a model guides by nothing else.
+        with torch.inference_mode(False):
+            found = insert(InsertConfig(**values))
         layers = found.layers()
         with Image.open(found.out / "composite.png") as picture:
             composite = _image(np.asarray(picture.convert("RGB")))

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from tests.builders.insertions import write_inputs
+from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.core.errors import InputError
 
 FOLDER = Path(__file__).resolve().parents[2] / "integrations/comfyui"
@@ -40,7 +41,8 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def called(nodes: ModuleType, name: str, **inputs: Any) -> tuple[Any, ...]:
     kind = nodes.NODE_CLASS_MAPPINGS[name]
-    result: tuple[Any, ...] = getattr(kind(), kind.FUNCTION)(**inputs)
+    with torch.inference_mode():  # as ComfyUI runs every node
+        result: tuple[Any, ...] = getattr(kind(), kind.FUNCTION)(**inputs)
     assert len(result) == len(kind.RETURN_TYPES)
     types = {"FLOAT": float, "STRING": str, "IMAGE": torch.Tensor, "MASK": torch.Tensor}
     for value, stated in zip(result, kind.RETURN_TYPES, strict=True):
@@ -100,7 +102,7 @@ def test_camera_and_light_are_estimated(nodes: ModuleType) -> None:
 def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
     write_inputs(tmp_path)
     photo = image_of(tmp_path / "photo.png")
-    occluder = torch.zeros(photo.shape[:3])
+    occluder = torch.zeros(1, 64, 64)  # what Load Image gives for a photo without alpha
     composite, mask, alone, shadow, light, folder = called(
         nodes,
         "WarpirInsertObject",
@@ -118,6 +120,20 @@ def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
     untouched = (mask == 0.0) & (shadow == 1.0).all(dim=-1)
     assert untouched.any() and torch.equal(composite[untouched], photo[untouched])
     assert (Path(folder) / "report.html").is_file() and Path(light).is_file()
+
+
+@pytest.mark.slow
+def test_a_model_guides(nodes: ModuleType, tmp_path: Path) -> None:
+    """It needs derivatives, which ComfyUI turns off round a node."""
+    write_inputs(tmp_path)
+    model = make_tiny_stable_diffusion(tmp_path / "model")
+    *_, folder = called(
+        nodes, "WarpirInsertObject", image=image_of(tmp_path / "photo.png"), size=0.4,
+        asset=str(tmp_path / "box.obj"), model=str(model), prompt="a box", samples=4, steps=2,
+        loss="sds-base", personalize=False, device="cpu",
+    )  # fmt: skip
+    record = json.loads((Path(folder) / "run.json").read_text())
+    assert record["measured"]["optimization"]["steps"] == 2
 
 
 def test_missing_asset_is_named(nodes: ModuleType) -> None:

@@ -221,6 +221,11 @@ def test_solid_glass_reads_back(tmp_path: Path) -> None:
         "attenuationColor": [0.5, 0.25, 1.0],
     }  # fmt: skip
     assert read_back(tmp_path, written).materials[0] == glass
+    # The extension's distance is one of the world; ours is one of the asset, and grows with it.
+    larger = write_glb(extended(glass), np.diag([4.0, 4.0, 4.0, 1.0]))
+    (material,) = document(larger)["materials"]
+    volume = material["extensions"]["KHR_materials_volume"]
+    assert volume["attenuationDistance"] == 0.5 and volume["thicknessFactor"] == 0.25
 
 
 def test_plain_asset_uses_no_extension() -> None:

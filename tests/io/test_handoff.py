@@ -3,11 +3,13 @@
 import ast
 import hashlib
 import importlib.util
+import io
 import json
 import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ from tests.builders.insertions import (
     write_inputs,
 )
 from tests.builders.programs.llvm import LIBRARY, llvm
+from tests.builders.shapes import box_before, camera
 from tests.io.images.test_envmap_conventions import radiance, read, threejs
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, read_inputs
@@ -41,6 +44,8 @@ from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.export import CUBE_SIZE, tone_curve_cube, web_map
 from warpir.look.response import Response
+from warpir.mitsuba.scene import write_mitsuba
+from warpir.scene.asset import Asset, Material, Texture, TextureSlot
 from warpir.scene.lamps import Sun
 from warpir.scene.light import fibonacci
 from warpir.scene.tone_curves import ToneKnots
@@ -518,6 +523,45 @@ def test_mitsuba_scene_is_xml_and_its_meshes_are_the_placed_ones(folder: Path) -
     mesh = trimesh.load(home / "mesh_000.ply", process=False)
     bounds = load_asset(folder / "out" / "object.glb").bounds()
     np.testing.assert_allclose(mesh.bounds, bounds, atol=1e-5)
+
+
+class Kept:
+    """Stands for the output folder: keeps the files by name."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, bytes] = {}
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        self.files[name] = content
+
+    def write_exr(self, name: str, planes: object) -> None:
+        """Leave the light out."""
+
+
+def test_mitsuba_scene_moves_textures_and_cuts_masks() -> None:
+    """``to_uv`` is a matrix of 4 x 4 whose last column moves; MASK is written as it covers."""
+    view = camera(32, 24, 40.0, (0.0, 1.6, 0.0))
+    inputs = box_before(
+        view, np.full((24, 32, 3), 0.5, np.float32), np.zeros((24, 32, 3), np.uint8)
+    )
+    pixels = np.full((1, 4, 4), 255, np.uint8)
+    pixels[0, :, 3] = 100, 127, 128, 255
+    slot = TextureSlot(0, transform=(2.0, 0.5, 0.25, -0.5, 3.0, 0.75))
+    cut = Material(base_color_texture=slot, alpha_mode="MASK", alpha_cutoff=0.5)
+    shape = replace(inputs.asset.primitives[0], uv0=np.zeros((8, 2), np.float32))
+    asset = Asset("box", (shape,), (cut,), (Texture(pixels),))
+    kept = Kept()
+    write_mitsuba(kept, replace(inputs, asset=asset), np.ones((8, 16, 3), np.float32), 3, 1)  # type: ignore[arg-type]
+    tree = ET.fromstring(kept.files["mitsuba/scene.xml"])
+    textures = {t.get("name"): t for t in tree.iter("texture")}
+    for texture in textures.values():
+        (matrix,) = texture.iter("matrix")
+        to_uv = np.array(str(matrix.get("value")).split(), float).reshape(4, 4)
+        moved = to_uv @ [0.3, 0.6, 0.0, 1.0]
+        assert moved[:2] == pytest.approx([2 * 0.3 + 0.5 * 0.6 + 0.25, -0.5 * 0.3 + 3 * 0.6 + 0.75])
+    named = {s.get("name"): s.get("value") for s in textures["opacity"].iter("string")}
+    with Image.open(io.BytesIO(kept.files[f"mitsuba/{named['filename']}"])) as picture:
+        assert np.asarray(picture).ravel().tolist() == [0, 0, 255, 255]
 
 
 IN_MITSUBA = """

@@ -794,3 +794,25 @@ def test_real_file_has_the_published_counts(name: str) -> None:
     if name == "spot/spot.obj":
         (material,) = asset.materials
         assert (material.roughness, material.metallic) == (0.25, 0.0)
+
+
+def test_mtl_share_and_mask_together_are_blended(tmp_path: Path) -> None:
+    """A cut at .5 of what is .4 everywhere would leave nothing of the object."""
+    Image.new("L", (2, 2), 255).save(tmp_path / "d.png")
+    Image.new("RGB", (2, 2)).save(tmp_path / "c.png")
+    (material,) = with_mtl(tmp_path, "map_Kd c.png\nmap_d d.png\nd 0.4\n").materials
+    assert material.alpha_mode == "BLEND" and material.alpha == 0.4
+
+
+@pytest.mark.parametrize(
+    ("lines", "is_told"),
+    [
+        ("Kd 0 0 0\nKs 1 .8 .3\nPr .5\n", True),
+        ("Kd 0 0 0\nKs 1 1 1\nPr .5\n", True),
+        ("Kd .5 .5 .5\nKs .5 .5 .5\nPr .5\n", False),
+        ("Kd 0 0 0\nKs 0 0 0\nPr .5\n", False),
+    ],
+)
+def test_mtl_specular_color_that_matters_is_told(tmp_path: Path, lines: str, is_told: bool) -> None:
+    """Gold by Phong's Ks would be black plastic without a word."""
+    assert any("Ks" in notice for notice in with_mtl(tmp_path, lines).notices) == is_told

@@ -197,6 +197,20 @@ def test_usdz_materials_read_the_same_texels(tmp_path: Path, rng: np.random.Gene
 
 
 @needs_usd
+def test_usdz_reflects_by_color_where_the_index_is_unknown(tmp_path: Path) -> None:
+    """GlTF's index 0, which specular-glossiness becomes, is no index: F0 is the color."""
+    from pxr import UsdShade
+
+    gloss = Material(ior=0.0, specular=0.5, specular_color=(0.08, 0.06, 0.04))
+    asset = Asset("box", (box((0.0, 0.0, -3.0), (1.0, 1.0, 1.0)),), (gloss,))
+    camera = Camera(64, 40, 50.0, 50.0, 32.0, 20.0, np.eye(4))
+    stage = stage_of(tmp_path / "scene.usdz", asset, np.eye(4), camera, SKY)
+    surface = UsdShade.Shader.Get(stage, "/scene/materials/material_0/surface")
+    values = {i.GetBaseName(): i.Get() for i in surface.GetInputs()}
+    assert "ior" not in values and values["useSpecularWorkflow"] == 1
+    assert tuple(values["specularColor"]) == pytest.approx((0.04, 0.03, 0.02))
+
+
 def test_usdz_of_a_run_has_its_sun_where_it_is(tmp_path: Path) -> None:
     """The dome light by OpenEXR's definition, which UsdLux names, on a stage whose +Y is up."""
     from pxr import Gf, Usd, UsdGeom, UsdLux

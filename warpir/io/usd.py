@@ -6,7 +6,7 @@ vectors, the transpose of ours. https://openusd.org/release/spec_usdpreviewsurfa
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +142,16 @@ def _primvar(mesh: UsdGeom.Mesh, p: Primitive, slot: TextureSlot, name: str) -> 
         written.Set(Vt.Vec2fArray.FromNumpy(moved.astype("f4")))
 
 
+def _reflectance(m: Material) -> Iterator[tuple[str, Any, Any, TextureSlot | None, str]]:
+    """Yield what the dielectric reflects: by its index, or by a colour, as glTF's index 0 means."""
+    if m.ior != 0.0:
+        yield "ior", TYPES.Float, m.ior, None, ""
+        return
+    color = tuple(m.specular * c for c in m.specular_color)
+    yield "useSpecularWorkflow", TYPES.Int, 1, None, ""
+    yield "specularColor", TYPES.Color3f, color, m.specular_color_texture, "rgb"
+
+
 def _material(
     stage: Usd.Stage, asset: Asset, m: Material, index: int, names: Names
 ) -> UsdShade.Material:
@@ -161,7 +171,7 @@ def _material(
         ("emissiveColor", rgb, m.emission, m.emission_texture, "rgb"),
         ("metallic", TYPES.Float, m.metallic, metal, "b"),
         ("roughness", TYPES.Float, m.roughness, metal, "g"),
-        ("ior", TYPES.Float, m.ior, None, ""),
+        *_reflectance(m),
         ("clearcoat", TYPES.Float, m.clearcoat, m.clearcoat_texture, "r"),
         ("clearcoatRoughness", TYPES.Float, coat, m.clearcoat_roughness_texture, "g"),
         ("normal", TYPES.Normal3f, (0.0, 0.0, 1.0), bump, "rgb"),

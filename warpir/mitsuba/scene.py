@@ -196,7 +196,7 @@ class _Scene:
         self.lines.append(f"    <!-- {_comment(material.name)} -->")
         if material.alpha_mode != "OPAQUE":
             self.lines.append('    <bsdf type="mask">')
-            self._value("opacity", material.base_color_texture, 3, material.alpha)
+            self._opacity(material)
             open_tags += 1
         self.lines.append('    <bsdf type="twosided">')
         if material.normal_texture is not None:
@@ -219,6 +219,17 @@ class _Scene:
         self._value("metallic", shared, 2, material.metallic)
         self.lines += ["    </bsdf>"] * (open_tags + 1)
 
+    def _opacity(self, material: Material) -> None:
+        """Write the coverage, cut where the material says so."""
+        slot, alpha = material.base_color_texture, material.alpha
+        if material.alpha_mode != "MASK":
+            self._value("opacity", slot, 3, alpha)
+        elif slot is None:
+            self._value("opacity", None, 3, float(alpha >= material.alpha_cutoff))
+        else:
+            is_there = self._pixels(slot)[..., 3] / 255.0 * alpha >= material.alpha_cutoff
+            self._bitmap("opacity", np.where(is_there, 255, 0).astype(np.uint8), slot)
+
     def _value(self, name: str, slot: TextureSlot | None, channel: int, factor: float) -> None:
         """Write a number, or a factor times one channel of a texture as a grey picture."""
         if slot is None:
@@ -235,7 +246,7 @@ class _Scene:
         self.output.write_bytes(f"{FOLDER}/{file}", png_bytes(codes, None, False, ""))
         texture: Texture = self.asset.textures[slot.texture]
         a, b, c, d, e, f = slot.transform
-        uv = np.array([[a, b, c, 0.0], [d, e, f, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+        uv = np.array([[a, b, 0.0, c], [d, e, 0.0, f], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
         self.lines += [
             f'    <texture type="bitmap" name="{name}">',
             f'        <string name="filename" value="{file}"/>',

@@ -220,6 +220,10 @@ def read_primitive(
         if stored is not None:
             tangents = stored.astype(np.float32)
             tangents[:, 3] = np.where(tangents[:, 3] < 0, -1.0, 1.0)
+            across = np.cross(tangents[:, :3], normals)
+            if (np.linalg.norm(across, axis=1) < 1e-3).any():
+                notices.append(f"{entry.pointer}: tangents without a direction, not used")
+                tangents = None
     uvs: list[FloatArray | None] = []
     for k in (0, 1):
         stored = read(f"TEXCOORD_{k}", ("VEC2",))
@@ -228,7 +232,7 @@ def read_primitive(
             stored = np.zeros((len(positions), 2))
         uvs.append(None if stored is None else stored.astype(np.float32))
     if entry.size("targets"):
-        notices.append(f"{entry.pointer}: morph targets ignored, the rest pose is used")
+        notices.append(f"{entry.pointer}: morph targets and their weights ignored")
     colors = read_colors(read("COLOR_0", ("VEC3", "VEC4")), entry, notices)
     return Primitive(positions, indices, material, normals, tangents, uvs[0], uvs[1], colors)
 

@@ -10,7 +10,7 @@ import io
 import json
 import math
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -70,7 +70,7 @@ def write_glb(asset: Asset, asset_to_world: Float64Array, camera: Camera | None 
                 "primitives": [_primitive(file, asset, p, center) for p in asset.primitives],
             }
         ],
-        "materials": [_material(file, m) for m in asset.materials],
+        "materials": [_material(file, _in_world(m, asset_to_world)) for m in asset.materials],
     }
     if camera is not None:
         document["cameras"] = [_camera(camera)]
@@ -81,6 +81,15 @@ def write_glb(asset: Asset, asset_to_world: Float64Array, camera: Camera | None 
     if file.extensions:
         document["extensionsUsed"] = sorted(file.extensions)
     return file.pack(document, asset.name)
+
+
+def _in_world(m: Material, asset_to_world: Float64Array) -> Material:
+    """Return a material whose attenuation distance is one of the world, as glTF's is.
+
+    The renderer's is one of the asset and grows with it; the thickness is one of the mesh in both.
+    """
+    scale = float(np.linalg.norm(asset_to_world[:3, 0]))
+    return replace(m, attenuation_distance=m.attenuation_distance * scale)
 
 
 def float32_center(asset: Asset) -> Float64Array:

@@ -276,6 +276,10 @@ class MaterialLibrary:
         left_out = [*entry.left_out, *(key for key in maps if key not in (*read, "map_ka"))]
         if left_out:
             self.notices.append(f"material {name!r}: {', '.join(left_out)[:80]} ignored")
+        specular = entry.numbers.get("ks", (0.0,))
+        if not entry.is_pbr and (np.ptp(specular) > 0.05 or max(specular) > 0.0 == max(color)):
+            shown_ks = " ".join(f"{value:g}" for value in specular)
+            self.notices.append(f"material {name!r}: Ks {shown_ks} ignored, a plain gloss is shown")
         sheen = self._share(name, "Ps", entry.number("ps", 0.0))
         if sheen > 0.0:
             self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
@@ -287,7 +291,8 @@ class MaterialLibrary:
             metallic=min(max(metallic, 0.0), 1.0),
             roughness=min(max(roughness, 0.0), 1.0),
             emission=(max(emission[0], 0.0), max(emission[1], 0.0), max(emission[2], 0.0)),
-            alpha_mode="MASK" if "map_d" in maps else "BLEND" if alpha < 1 else "OPAQUE",
+            # A cut at .5 of what is half there already would leave nothing.
+            alpha_mode="BLEND" if alpha < 1 else "MASK" if "map_d" in maps else "OPAQUE",
             double_sided=True,
             normal_scale=1.0 if normal is None else normal.bump,
             ior=self._ior(name, entry),
