@@ -112,7 +112,14 @@ class DatasetUpdate(GatedGuidance):
                 adapter=self.adapter,
             )
 
-        return next(self.prior.in_chunks(edited, 1, "an edit of the picture", "--precision"))
+        def whole() -> Tensor:
+            return next(self.prior.in_chunks(edited, 1, "an edit of the picture", "--precision"))
+
+        picture = whole()
+        is_spoilt = not bool(picture.isfinite().all()) and bool(image.isfinite().all())
+        if is_spoilt and self.prior.upcast("edits of the picture"):
+            picture = whole()
+        return picture
 
     def _distance(self, image: Tensor, crop: Crop, edited: Tensor) -> Tensor:
         difference = crop.apply(image, self.prior.resolution) - edited.to(image)

@@ -138,7 +138,7 @@ class Guidance(GatedGuidance):
         """
         d_image = self._gradient(image, step)
         is_spoilt = not bool(d_image.isfinite().all()) and bool(image.isfinite().all())
-        if is_spoilt and self.prior.upcast():  # half precision was too narrow
+        if is_spoilt and self.prior.upcast("gradients"):  # half precision was too narrow
             d_image = self._gradient(image, step)
         return self.gate.passed(d_image)
 
@@ -190,6 +190,13 @@ class Guidance(GatedGuidance):
             seed: Of noises and crops; the guidance's own by default.
             pairs: Noises.
         """
+        score = self._score(image, seed, pairs)
+        is_spoilt = not math.isfinite(score) and bool(image.isfinite().all())
+        if is_spoilt and self.prior.upcast("scores"):
+            score = self._score(image, seed, pairs)
+        return score if math.isfinite(score) else None
+
+    def _score(self, image: Tensor, seed: int | None, pairs: int) -> float:
         scores = []
         for crops in self._fixed_crops(image, "score", seed, pairs):
             predictions = self._predictions(crops).double()
@@ -198,8 +205,7 @@ class Guidance(GatedGuidance):
             else:
                 errors = self._weighted_sum((predictions - crops.noise).square())
             scores.append((crops.weight * errors).sum(dim=(1, 2, 3)))
-        score = float(torch.cat(scores).mean())
-        return score if math.isfinite(score) else None
+        return float(torch.cat(scores).mean())
 
     @torch.no_grad()
     def work(self, start: Tensor, middle: Tensor, end: Tensor, draws: Sequence[int]) -> list[float]:

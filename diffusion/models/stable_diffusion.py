@@ -345,24 +345,23 @@ class StableDiffusion:
             weight.data = weight.data.float()
         self.unet_dtype = torch.float32
 
-    def upcast(self) -> bool:
-        """Let UNet and VAE compute in fp32 from now on; return False where they do already."""
+    def upcast(self, what: str) -> bool:
+        """Compute in fp32 from now on, as ``what`` were not finite; return False where it does."""
         before = self.precision
         self.use_full_precision()
         self.vae.float()
+        if self.precision != before:
+            self._notice(f"the model computes in fp32: {what} were not finite before")
         return self.precision != before
 
     def finite(self, compute: Callable[[], Tensor], what: str) -> Tensor:
         """Return what is computed; in fp32 from now on if half precision overflows.
 
-        A person reads ``what`` it is.
-
         Raises:
-            NonFiniteError: It is not finite in fp32 either.
+            NonFiniteError: It is not finite in fp32 either; ``what`` names it.
         """
         computed = compute()
-        if not bool(computed.isfinite().all()) and self.upcast():
-            self._notice(f"the model computes in fp32: {what} were not finite before")
+        if not bool(computed.isfinite().all()) and self.upcast(what):
             computed = compute()
         if not bool(computed.isfinite().all()):
             raise NonFiniteError(f"{what} are not finite (found nan or inf), in fp32 too")

@@ -210,8 +210,9 @@ class LoraTraining:
         state: dict[str, Any] = {"key": self.key, "step": self.step_count, "losses": self.losses()}
         for key, parameter in self.parameters.items():
             state[f"lora.{key}"] = _to_cpu(parameter)
-            for moment in ("exp_avg", "exp_avg_sq"):
-                state[f"{moment}.{key}"] = _to_cpu(self.optimizer.state[parameter][moment])
+            # The optimiser's own count too: it leaves out the steps that were skipped.
+            for name in ("step", "exp_avg", "exp_avg_sq"):
+                state[f"{name}.{key}"] = _to_cpu(self.optimizer.state[parameter][name])
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -232,9 +233,8 @@ class LoraTraining:
             for key, parameter in self.parameters.items():
                 parameter.copy_(state[f"lora.{key}"])
                 held = self.optimizer.state[parameter]
-                held["step"].fill_(self.step_count)
-                for moment in ("exp_avg", "exp_avg_sq"):
-                    held[moment].copy_(state[f"{moment}.{key}"])
+                for name in ("step", "exp_avg", "exp_avg_sq"):
+                    held[name].copy_(state[f"{name}.{key}"])
 
     def _arithmetic(self) -> AbstractContextManager[Any]:
         if self.prior.device.type != "cuda":

@@ -183,6 +183,20 @@ def test_upright_edges_tell_the_roll() -> None:
     assert upright_roll(segments[:8], (240.0, 160.0), camera.fx, -4.0, 1.0) is None
 
 
+@pytest.mark.parametrize("pitch", [-80.0, -65.0, 65.0])
+def test_edges_of_a_floor_seen_from_above_are_not_upright(pitch: float) -> None:
+    """Where up lies nearly along the optical axis any edge may pass for an upright one."""
+    camera = a_camera(roll_deg=0.0, pitch_deg=pitch).camera(480, 320, 1.6)
+    rng = np.random.default_rng(0)
+    slabs = [[x, 20.0, x + rng.normal(), 300.0] for x in np.linspace(30.0, 450.0, 20)]
+    centre = (240.0, 160.0)
+    assert upright_roll(np.array(slabs), centre, camera.fx, pitch, 0.0) is None
+    along = [
+        [y, x, y2, x + rng.normal()] for y, x, y2 in [(20.0, x, 460.0) for x in range(20, 300, 14)]
+    ]
+    assert upright_roll(np.array(along), centre, camera.fx, pitch, 0.0) is None
+
+
 def test_segments_of_a_drawn_post() -> None:
     photo = np.zeros((200, 300, 3), np.float32)
     photo[20:180, 140:160] = 1.0

@@ -67,7 +67,7 @@ class Painter:
         random = [torch.Generator().manual_seed(int(k[:12], 16)) for k in key]
         return torch.stack([torch.rand(3, 16, 16, generator=g) for g in random])
 
-    def upcast(self) -> bool:
+    def upcast(self, what: str) -> bool:
         return False
 
 

@@ -79,7 +79,7 @@ class GaussianPrior:
     prompts: list[str] = field(default_factory=list)
     in_chunks: InChunks = at_once
 
-    def upcast(self) -> bool:
+    def upcast(self, what: str) -> bool:
         """Return False: everything is computed in full precision."""
         return False
 
@@ -116,6 +116,22 @@ class GaussianPrior:
         self.calls.append(Call(latents_noisy, t, prompts, list(adapters)))
         samples = zip(latents_noisy, t, prompts, adapters, strict=True)
         return torch.stack([self.noise(*sample) for sample in samples])
+
+
+class NarrowPrior(GaussianPrior):
+    """Predicts nothing finite until it computes in full precision."""
+
+    is_half = True
+    said: str = ""
+
+    def upcast(self, what: str) -> bool:
+        """Widen it, as `StableDiffusion.upcast` does."""
+        was_half, self.is_half, self.said = self.is_half, False, what
+        return was_half
+
+    def predict(self, *given: Any) -> Tensor:
+        found = super().predict(*given)
+        return found * torch.nan if self.is_half else found
 
 
 def picture(rng: np.random.Generator, height: int = 4, width: int = 4) -> Tensor:
@@ -872,3 +888,18 @@ def test_prompts_are_embedded_once(rng: np.random.Generator) -> None:
     for step in range(3):
         made.gradient(picture(rng), step)
     assert made.score(picture(rng)) is not None
+
+
+def test_gradient_and_score_fall_back_to_full_precision(rng: np.random.Generator) -> None:
+    """What half precision cannot hold is computed again, and said; not so of a bad picture."""
+    image = picture(rng)
+    wide = guidance(GaussianPrior(), at_time(0.4))
+    narrow = guidance(NarrowPrior(), at_time(0.4))
+    found, expected = narrow.gradient(image, 0), wide.gradient(image, 0)
+    assert found is not None and expected is not None and torch.equal(found, expected)
+    for pairs in (2, 4):
+        narrow = guidance(NarrowPrior(), at_time(0.4))
+        assert narrow.score(image, pairs=pairs) == wide.score(image, pairs=pairs)
+    prior = NarrowPrior()
+    assert guidance(prior, at_time(0.4)).score(image * torch.nan) is None
+    assert prior.is_half and not prior.said

@@ -451,6 +451,30 @@ def test_a_resumed_training_ends_with_the_same_bytes(
     assert rest.evaluation == whole.evaluation
 
 
+def test_a_resumed_training_knows_which_steps_were_skipped(
+    epsilon: StableDiffusion, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The optimiser's bias correction goes by the steps that it took."""
+    kept: dict[str, Any] = {}
+    real, calls = torch.nn.utils.clip_grad_norm_, []
+
+    def first_is_bad(parameters: Any, limit: float) -> Tensor:
+        calls.append(limit)
+        norm: Tensor = real(parameters, limit)
+        return norm * torch.nan if len(calls) == 1 else norm
+
+    def keep(training: LoraTraining) -> None:
+        if training.step_count == 3:
+            kept.update(training.state_dict())
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", first_is_bad)
+    whole = personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None, on_step=keep)
+    assert int(whole.losses.isnan().any(dim=1).sum()) == 1
+    fresh = load(folders["epsilon"])
+    rest = personalize(fresh, PHOTO, PROMPTS, SETTINGS, 0, None, resume=kept)
+    assert content(rest.lora) == content(whole.lora)
+
+
 def test_another_trainings_checkpoint_is_refused(epsilon: StableDiffusion) -> None:
     kept: dict[str, Any] = {}
     personalize(

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from tests.builders.image_files import matrix_profile
 from tests.builders.insertions import (
     arguments,
     go,
@@ -80,21 +81,24 @@ def test_all_off_gives_the_bytes_of_a_run_without_the_stage(
     assert (codes != auto.image()).any(axis=-1).sum() > 500
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg"])
+@pytest.mark.parametrize("kind", ["png", "jpg", "p3.png"])
 def test_black_and_white_photo_has_a_grey_object(
     inputs: Path, tmp_path: Path, device: str, kind: str
 ) -> None:
     """Object, shadow and grain have no colour, in picture and layers, unless that is asked for."""
     colored, photo = tmp_path / "colored.png", tmp_path / f"photo.{kind}"
     write_photographed(colored, 8)
-    Image.open(colored).convert("L").save(photo)
+    profile = matrix_profile("p3") if kind == "p3.png" else None
+    mode = "RGB" if profile else "L"  # of a profile for colours
+    Image.open(colored).convert("L").convert(mode).save(photo, icc_profile=profile)
     lamp = {"light": None, "sun": "40,30", "sky": "clear"}
     (tmp_path / "grey").mkdir()
     words = {"photo": str(photo), "device": device, **lamp}
     grey = go(arguments(inputs, tmp_path / "grey" / "out", **words), tmp_path / "grey" / "out")
     assert grey.record["measured"]["look"]["grey"] is True
     assert any("black and white" in line for line in grey.record["assumed"])
-    assert np.ptp(grey.image().astype(int), axis=-1).max() == 0
+    # A code that comes out of a profile and goes back may be rounded either way.
+    assert np.ptp(grey.image().astype(int), axis=-1).max() <= (profile is not None)
     planes = read_layers(tmp_path / "grey" / "out" / "layers.exr")
     for name in ("fg", "specular", "shadow", "grain"):
         layer = rgb(planes, f"{name}.")

@@ -34,6 +34,19 @@ def test_far_directions_are_those_of_the_panorama() -> None:
     np.testing.assert_allclose(detail.radiance[seen], expected[seen], atol=0.004)
 
 
+def test_photo_that_was_made_smaller_is_not_made_smaller_again() -> None:
+    """The camera is that of the photo as it was taken; what is sharp in the copy stays sharp."""
+    camera = camera_from_fov(512, 340, 60.0, 10.0, 1.6)
+    u = np.arange(512) + 0.5
+    stripes = np.broadcast_to(0.5 + 0.4 * np.sin(2.0 * np.pi * u / 16.0), (340, 512))
+    photo = np.repeat(stripes[..., None], 3, axis=2).astype(np.float32)
+    point = np.array([0.0, 0.5, -5.0])
+    small = seen_from(point, photo, camera, GROUND)
+    large = seen_from(point, photo, camera.scaled(4096, 2720), GROUND)
+    assert np.ptp(small.radiance[small.weight > 0.99]) > 0.6
+    np.testing.assert_allclose(large.radiance, small.radiance, atol=1e-3)
+
+
 def test_the_ground_is_seen_where_it_lies() -> None:
     """A chequered plane, painted into the photo, is seen from the object as the same plane."""
     camera = camera_from_fov(640, 480, 60.0, -20.0, 1.6)

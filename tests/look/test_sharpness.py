@@ -48,6 +48,13 @@ def test_known_blur_is_found(sigma: float, noise: float) -> None:
     assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
 
 
+def test_blur_beyond_the_derivatives_is_found() -> None:
+    """Twice as blurred is told as more blurred, up to where nothing of the boxes is left."""
+    found = [estimate_blur(boxes(sigma, height=320, width=480)) for sigma in (3.0, 4.5, 6.0)]
+    sigmas = [blur.sigma for blur in found if blur is not None]
+    assert sigmas == pytest.approx([3.0, 4.5, 6.0], rel=0.15)
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.1, 0.3, 0.5, 1.6])
 def test_blur_has_its_variance(sigma: float) -> None:
     """However small; a point keeps its sum."""

@@ -298,7 +298,8 @@ class OptimizeSettings:
     guidance_width: int = option(384, "W", expert=True, low=8, high=4096)
     """Width of the picture inside the loop [px]; its height follows the photo's shape"""
     lobes: int = option(64, "N", expert=True, low=1, high=4096)
-    """Spherical-Gaussian lobes of each light, the object's and the shadow's"""
+    """Spherical-Gaussian lobes of each light, the object's and the shadow's, where an even or a
+    given light starts; the estimate has 15 of its own"""
     lobe_width: float = option(0.6, "SPACINGS", expert=True, low=0.05, high=10)
     """Width of the lobes at the start of an even light, sigma in spacings of the lobes"""
     light_height: int = option(64, "ROWS", expert=True, low=4, high=512)

@@ -32,6 +32,9 @@ FEWEST = 10
 """Segments that must agree before they are believed."""
 LEAST_SHARE = 0.6
 """Of the length of all nearly upright segments that must agree."""
+UPRIGHT = np.cos(np.radians(45.0))
+"""Least length of the upward direction across the optical axis [1]: of a camera that looks further
+down or up, it lies so nearly along the axis that a few degrees of it turn the roll round."""
 SIGMA_DEG = 0.7
 """Standard deviation of what is believed, on crops of places that the network has not seen."""
 
@@ -103,5 +106,7 @@ def upright_roll(
         chosen = np.abs(normals @ up) < np.sin(np.radians(INLIER_DEG))
     is_clear = lengths[chosen].sum() >= LEAST_SHARE * lengths.sum()
     if chosen.sum() < FEWEST or not is_clear or up @ guess < np.cos(np.radians(CONE_DEG)):
+        return None
+    if np.hypot(up[0], up[1]) < UPRIGHT:
         return None
     return float(np.degrees(np.arctan2(up[0], up[1])))

@@ -87,8 +87,8 @@ def seen_from(
 
     Args:
         viewpoint: World frame [m], shape [3].
-        radiance: The photo before its tone curve, shape [H, W, 3].
-        camera: At the photo's resolution.
+        radiance: The photo before its tone curve, of any size, shape [H, W, 3].
+        camera: At the photo's own resolution.
         ground: Plane (a, b, c, d), unit normal on the camera's side, shape [4].
         height: Rows of the map.
     """
@@ -114,7 +114,7 @@ def seen_from(
 
 def _texel_sized(radiance: FloatArray, camera: Camera, rows: int) -> FloatArray:
     """Average the photo until a pixel in its middle is as large as a texel of the map."""
-    scale = rows / np.pi / camera.fx
+    scale = rows / np.pi / (camera.fx * radiance.shape[1] / camera.width)
     if scale >= 1.0:
         return radiance
     height, width = (max(2, round(side * scale)) for side in radiance.shape[:2])

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, in_bands
+from warpir.core.arrays import (
+    AnyFloatArray,
+    BoolArray,
+    Float64Array,
+    FloatArray,
+    PixelArray,
+    in_bands,
+)
 from warpir.core.color import GAMMA, luminance
 from warpir.io.images.jpeg import JpegCoding
 from warpir.look.grain import Grain, as_told, blocks_over, estimate_grain, grain_over
@@ -119,9 +126,11 @@ class CameraLook:
         gamma: float,
     ) -> FloatArray | None:
         """Return what `grain_over` and then `blocks_over` add; None without both."""
-        added = None
-        if self.grain is not None:
-            added = grain_over(self.grain, composite, plate, matte, changed, seed, gamma)
+        added, grain = None, self.grain
+        if grain is not None:
+            if self.is_grey:  # the mean of channels that differ would be weaker
+                grain = replace(grain, correlation=1.0)
+            added = grain_over(grain, composite, plate, matte, changed, seed, gamma)
             composite = composite + added
         if self.jpeg is not None:
             blocks = blocks_over(self.jpeg, composite, changed, gamma)
@@ -168,9 +177,9 @@ class CameraLook:
         }
 
 
-def is_black_and_white(srgb: AnyFloatArray) -> bool:
-    """Return whether a photo, shape [H, W, 3], has equal channels everywhere, and is no flat."""
-    return bool((srgb == srgb[..., :1]).all() and (srgb != srgb[0, 0]).any())
+def is_black_and_white(codes: PixelArray) -> bool:
+    """Return whether a photo's codes [H, W, 3] have equal channels everywhere, but are no flat."""
+    return bool((codes == codes[..., :1]).all() and (codes != codes[0, 0]).any())
 
 
 def _as_grey(plane: FloatArray) -> FloatArray:

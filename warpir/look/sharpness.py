@@ -14,7 +14,7 @@ from scipy.special import ive
 from warpir.core.arrays import AnyFloatArray, BoolArray, FloatArray, mask_box, on_cores
 from warpir.core.color import luminance
 from warpir.core.memory import core_count
-from warpir.look.texture import CLIPPED, Texture, read_texture
+from warpir.look.texture import CLIPPED, SMALLEST, Texture, read_texture
 
 FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 """Standard deviations of the Gaussian derivatives [px]; the ratio of the first two tells the blur,
@@ -35,6 +35,10 @@ WEAK = 0.2
 weak, and soft by themselves."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
+SOFT, BROAD, WIDER = 1.2, 2.5, 1.25
+"""Blur from which on the photo is asked at half its size too [px], the least that is believed of
+that [px], and by which factor it must be the larger one [1]: what the widest derivative hardly sees
+reads too low, a blur of 6 px as 1.6."""
 PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of a square pixel, the blur that a rendered edge has already [px]."""
 TRUNCATE = 3.5
@@ -72,6 +76,23 @@ def estimate_blur(
     Returns:
         The blur, or None where the photo has too few edges.
     """
+    found = _blur_at_size(linear, region, texture)
+    if found is None or found.sigma < SOFT or min(linear.shape[:2]) < 4 * SMALLEST:
+        return found
+    height, width = (side // 2 * 2 for side in linear.shape[:2])
+    tiles = linear[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
+    half = estimate_blur(tiles.mean(axis=(1, 3)), None if region is None else region[1::2, 1::2])
+    # Its pixel is as wide as two.
+    sigma = 0.0 if half is None else math.sqrt(4.0 * half.sigma**2 - 3.0 * PIXEL_SIGMA**2)
+    if half is None or sigma < max(BROAD, WIDER * found.sigma):
+        return found
+    return EdgeBlur(sigma, half.edges)
+
+
+def _blur_at_size(
+    linear: AnyFloatArray, region: BoolArray | None, texture: Callable[[], Texture] | None
+) -> EdgeBlur | None:
+    """Return the blur of `estimate_blur` by the photo's own pixels."""
     lum = luminance(np.asarray(linear, np.float32))
     with ThreadPoolExecutor(core_count()) as pool:
         (fine, gx, gy), (coarse, *_), (wide, *_), mean = (

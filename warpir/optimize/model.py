@@ -203,10 +203,13 @@ def personalized(
         run.progress.report(stage, done, total)
         signals.check()
 
+    held = None
     if resumed is not None and resumed.stage == "optimize":
-        learnt = restore_personalization(prior, resumed.state["guided"]["learnt"])
+        held = resumed.state["guided"]["learnt"]  # None of a loss that does without an adapter
+    if held is not None:
+        learnt = restore_personalization(prior, held)
     else:
-        state = None if resumed is None else resumed.state
+        state = resumed.state if resumed is not None and resumed.stage == "personalize" else None
         with signals.deferred():
             learnt = personalize(*given, report=report, on_step=on_step, resume=state)
     if shown := config.guidance.show_prior:

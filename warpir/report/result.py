@@ -139,7 +139,7 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
     words = asked.sharpness, asked.grain, response
     look = estimate_look(photo.srgb, photo.linear(), around, *words, photo.jpeg)
     if asked.response != "off":
-        look = replace(look, is_grey=is_black_and_white(photo.srgb))
+        look = replace(look, is_grey=is_black_and_white(photo.codes))
     if "auto" in words or look.is_grey:
         run.log.assume(*look.lines())
     return look
