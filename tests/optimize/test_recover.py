@@ -178,6 +178,13 @@ def test_resume_names_what_changed(
     assert "Traceback" not in error and digest(unfinished) == before
 
 
+def test_resume_follows_the_advice_to_raise_the_precision(folder: Path, unfinished: Path) -> None:
+    """What a run that overflowed is told to try is no other run."""
+    again = [*argv(folder, unfinished), "--resume", "--precision", "fp32"]
+    assert main(again) == ExitCode.DONE
+    assert record_of(unfinished)["measured"]["optimization"]["steps"] == 8
+
+
 @pytest.mark.slow
 def test_resume_without_a_checkpoint_starts_and_says_so(
     folder: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -40,11 +40,11 @@ PREVIEW_SAMPLES = 16
 NOT_IDENTITY = frozenset(
     {"out", "overwrite", "resume", "preview_every", "checkpoint_every", "threads", "mark"}
     | {"allow_download", "show_prior", "samples", "rays", "indirect_limit", "width", "device"}
-    | {"accept", "report"}
+    | {"accept", "report", "precision", "vae_precision"}
     | {name for name in DEFAULTS if name.startswith("max_")}
 )
-"""Settings that a resumed run may change: they do not affect the optimisation, or, as the device,
-are compared by their resolved value."""
+"""Settings that a resumed run may change: they do not affect the optimisation, or are compared by
+their resolved value, as the device, or are what a run that overflowed shall change: precision."""
 
 
 @dataclass(frozen=True)
