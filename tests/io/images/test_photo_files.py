@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import struct
 import tracemalloc
 from functools import partial
@@ -1012,3 +1013,31 @@ def test_real_photographs() -> None:
         assert 0.0 <= photo.srgb.min() < photo.srgb.max() <= 1.0
         same = photo.encode(photo.srgb, np.zeros(photo.codes.shape[:2], bool))
         np.testing.assert_array_equal(same, photo.codes)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "exr"])
+def test_border_of_one_colour_is_told(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    """Bars and frames are nothing that the scene's light or a lens made; sky at one side is."""
+    photo = rng.integers(30, 226, (64, 96, 3)).astype(np.uint8)
+
+    def told(picture: np.ndarray) -> list[str]:
+        path = tmp_path / f"p.{kind}"
+        if kind == "exr":
+            write_image(path, picture.astype(np.float32) / 255.0)
+        else:
+            Image.fromarray(picture).save(path, quality=95)
+        return [notice for notice in read_photo(path).notices if "border" in notice]
+
+    assert not told(photo)
+    sky = photo.copy()
+    sky[:9] = 255
+    assert not told(sky)
+    bars = photo.copy()
+    bars[:16] = bars[-16:] = 0
+    (notice,) = told(bars)
+    # JPEG may touch the last row.
+    assert re.search(r"1[56] px at the top, 1[56] px at the bottom: ", notice)
+    framed = np.full((96, 128, 3), 250, np.uint8)
+    framed[16:-16, 16:-16] = photo
+    (notice,) = told(framed)
+    assert re.search(r"1[56] px at the left, 1[56] px at the right: ", notice)

@@ -104,6 +104,8 @@ class Photo:
         return codes
 
 
+EVEN = 0.016
+"""How far the values of a border may differ, as JPEG makes them, over the largest code [1]."""
 LABELS = 0.05
 """Below this share of white the codes of a mask are labels, not shares."""
 
@@ -143,6 +145,11 @@ def read_photo(
         notices.append("grey image expanded to three channels")
     if bool((codes == codes[0, 0]).all()):
         notices.append("no signal: every pixel has the same value")
+    elif border := _border_of(codes):
+        notices.append(
+            f"a border of one colour, {border}: light, camera and look are estimated with it, "
+            "so cut it off"
+        )
 
     icc: bytes | None = None
     if codes.dtype.kind == "f":
@@ -163,6 +170,28 @@ def read_photo(
         tuple(notices),
         read_coding(path, image.orientation) if image.kind == "jpeg" and icc is None else None,
     )
+
+
+def _border_of(codes: PixelArray) -> str:
+    """Return how wide a letterbox's bars or a frame are, in words; nothing where there is none.
+
+    Rows or columns of one colour at both of two opposite sides: at one side it may be the sky.
+    """
+    tolerance = EVEN * (np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1.0)
+    found = []
+    for turned, sides in ((codes, ("top", "bottom")), (codes.swapaxes(0, 1), ("left", "right"))):
+        color = turned[0].mean(axis=0)
+
+        def width(lines: PixelArray, color: Float64Array = color) -> int:
+            for k, line in enumerate(lines):
+                if not (np.abs(line - color) <= tolerance).all():
+                    return k
+            return 0  # nothing else is there
+
+        widths = [width(turned), width(turned[::-1])]
+        if all(widths):
+            found += [f"{w} px at the {side}" for w, side in zip(widths, sides, strict=True)]
+    return ", ".join(found)
 
 
 def read_envmap(
