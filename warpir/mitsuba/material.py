@@ -330,16 +330,25 @@ class GltfBSDF(mi.BSDF):
             coat_frame=mi.Frame3f(coat_n),
             stopped=None,
         )
-        # KHR_materials_transmission, at the angle with the normal before any map
-        cosine = dr.abs(dr.dot(si.sh_frame.n, wo))
+        surface.stopped = 1.0 - self._passing(surface, si, clearcoat, sheen_roughness)
+        return surface
+
+    def _passing(
+        self,
+        surface: Surface,
+        si: mi.SurfaceInteraction3f,
+        clearcoat: mi.Float,
+        sheen_roughness: mi.Float,
+    ) -> mi.Float:
+        """Share that passes (KHR_materials_transmission), by the normal before any map."""
+        cosine = dr.abs(dr.dot(si.sh_frame.n, surface.wo))
         enters = 1.0 - dr.max(surface.reflectance(cosine)[0])
         enters *= 1.0 - clearcoat * (0.04 + 0.96 * schlick_weight(cosine))
         if self.sheen_table is not None:
             E = read_sheen_table(self.sheen_table, cosine, sheen_roughness)
-            enters *= 1.0 - dr.max(sheen) * E
-        passes = surface.transmission * (1.0 - metallic) * mi.luminance(base_color) * enters
-        surface.stopped = 1.0 - passes
-        return surface
+            enters *= 1.0 - dr.max(surface.sheen_color) * E
+        tint = mi.luminance(surface.base_color)
+        return surface.transmission * (1.0 - surface.metallic) * tint * enters
 
     def _film(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool
