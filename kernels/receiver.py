@@ -231,11 +231,12 @@ def object_window(mesh: MeshArgs, origin: wp.vec3, normal: wp.vec3) -> ObjectWin
         if along > 1.0e-4:
             window.frame.x = wp.normalize(toward - normal * (up * distance))
             window.frame.y = wp.cross(normal, window.frame.x)
-        window.low = wp.vec2(along * spare - up * reach, -reach)
+        low_x = along * spare - up * reach
         if up < 0.0:
             # Of a sphere whose centre is below the horizon, what is seen reaches furthest down at
             # the horizon, where the cosine with the direction to the centre is `spare`.
-            window.low[0] = wp.min(window.low[0], spare / wp.max(along, 1.0e-6))
+            low_x = wp.min(low_x, spare / wp.max(along, 1.0e-6))
+        window.low = wp.vec2(low_x, -reach)
         window.high = wp.vec2(1.0, reach)
         if up > reach:
             window.high = wp.vec2(along * spare + up * reach, reach)
