@@ -12,7 +12,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -272,7 +272,11 @@ class OutputFolder:
             return writer(), hashes
 
         with ThreadPoolExecutor(core_count()) as pool:
-            done = list(pool.map(call, writers))
+            futures = [pool.submit(call, writer) for writer in writers]
+            # A signal that comes just before a wait begins does not end it, so none is long.
+            while wait(futures, timeout=0.05).not_done:
+                pass
+            done = [future.result() for future in futures]
         for _, hashes in done:
             self._hashes |= hashes
         return [result for result, _ in done]

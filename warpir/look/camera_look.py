@@ -13,11 +13,11 @@ from warpir.core.arrays import (
     BoolArray,
     Float64Array,
     FloatArray,
-    PixelArray,
     in_bands,
 )
 from warpir.core.color import GAMMA, luminance
 from warpir.io.images.jpeg import JpegCoding
+from warpir.io.images.photos import Photo
 from warpir.look.grain import Grain, as_told, blocks_over, estimate_grain, grain_over
 from warpir.look.response import PLACED, Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
@@ -177,9 +177,15 @@ class CameraLook:
         }
 
 
-def is_black_and_white(codes: PixelArray) -> bool:
-    """Return whether a photo's codes [H, W, 3] have equal channels everywhere, but are no flat."""
-    return bool((codes == codes[..., :1]).all() and (codes != codes[0, 0]).any())
+def look_of_preview(photo: Photo, response: float | str) -> CameraLook:
+    """Return what a preview has of a photo's look: it is grey where that is black and white.
+
+    That is where the channels of its codes are equal everywhere, but for a photo of one value.
+    ``response`` is that of `estimate_look`; ``off`` leaves colours.
+    """
+    codes = photo.codes
+    is_grey = response != "off" and bool((codes == codes[..., :1]).all())
+    return CameraLook(is_grey=is_grey and bool((codes != codes[0, 0]).any()))
 
 
 def _as_grey(plane: FloatArray) -> FloatArray:

@@ -78,6 +78,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
     Raises:
         InputError: As `warpir.insert` refuses it.
     """
+    from warpir.look.camera_look import look_of_preview
     from warpir.render.composite import make_picture
     from warpir.render.device import keep_kernels
     from warpir.render.picture.quality import Quality
@@ -92,6 +93,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
         Quality(PREVIEW_SAMPLES, 1, PREVIEW_DEPTH, config.render.seed, PREVIEW_LIMIT),
         lit.curves,
         occluder=inputs.occluder,
+        look=look_of_preview(inputs.photo, config.look.response),
     )
     keep_kernels()  # this process may be killed
     Image.fromarray(codes_of(picture.image)).save(job["picture"], "PNG", compress_level=1)

@@ -22,7 +22,7 @@ from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import (
     CameraLook,
     estimate_look,
-    is_black_and_white,
+    look_of_preview,
     region_around,
 )
 from warpir.look.denoise import denoiser_version
@@ -97,6 +97,7 @@ def write_preview(run: Run, light: SceneLight) -> None:
     if not settings.preview_every:
         return
     with run.timings.stage("preview"):
+        look = look_of_preview(run.inputs.photo, run.config.look.response)
         run = replace(run, inputs=_small_inputs(run.inputs))
         camera = _rendering_camera(run.inputs.camera, run.config.render.width)
         # Of a photo that is enlarged, no more than the photo has.
@@ -105,7 +106,7 @@ def write_preview(run: Run, light: SceneLight) -> None:
         placed = scene_of(run.inputs, camera, run.device, light.curves)
         asked = run.config.render
         renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
-        picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1)
+        picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1, look)
         codes = run.inputs.photo.encode(picture.image, picture.changed)
         run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
@@ -138,8 +139,7 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
         response = "off"
     words = asked.sharpness, asked.grain, response
     look = estimate_look(photo.srgb, photo.linear(), around, *words, photo.jpeg)
-    if asked.response != "off":
-        look = replace(look, is_grey=is_black_and_white(photo.codes))
+    look = replace(look, is_grey=look_of_preview(photo, asked.response).is_grey)
     if "auto" in words or look.is_grey:
         run.log.assume(*look.lines())
     return look
