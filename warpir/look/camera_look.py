@@ -8,13 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import (
-    AnyFloatArray,
-    BoolArray,
-    Float64Array,
-    FloatArray,
-    in_bands,
-)
+from warpir.core.arrays import AnyFloatArray, BoolArray, Float64Array, FloatArray, in_bands
 from warpir.core.color import GAMMA, luminance
 from warpir.io.images.jpeg import JpegCoding
 from warpir.io.images.photos import Photo

@@ -19,12 +19,7 @@ from warpir.io.layers import write_layers
 from warpir.io.lobes_file import lobes_to_json
 from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
-from warpir.look.camera_look import (
-    CameraLook,
-    estimate_look,
-    look_of_preview,
-    region_around,
-)
+from warpir.look.camera_look import CameraLook, estimate_look, look_of_preview, region_around
 from warpir.look.denoise import denoiser_version
 from warpir.render.composite import UNCHANGED, Picture, make_picture
 from warpir.render.picture.light_preview import balls

@@ -1032,6 +1032,9 @@ def test_border_of_one_colour_is_told(tmp_path: Path, rng: np.random.Generator, 
     sky = photo.copy()
     sky[:9] = 255
     assert not told(sky)
+    night = np.zeros_like(photo)  # lit windows here and there
+    night[12:-12, 20:50], night[10:-10, 60:64] = photo[12:-12, 20:50], photo[10:-10, 60:64]
+    assert not [n for n in told(night) if "top" in n]
     bars = photo.copy()
     bars[:16] = bars[-16:] = 0
     (notice,) = told(bars)

@@ -175,7 +175,8 @@ def read_photo(
 def _border_of(codes: PixelArray) -> str:
     """Return how wide a letterbox's bars or a frame are, in words; nothing where there is none.
 
-    Rows or columns of one colour at both of two opposite sides: at one side it may be the sky.
+    Rows or columns of one colour at both of two opposite sides: at one side it may be the sky. They
+    end at once: white snow under a white sky, and the dark of a night, do so bit by bit.
     """
     tolerance = EVEN * (np.iinfo(codes.dtype).max if codes.dtype.kind == "u" else 1.0)
     found = []
@@ -185,7 +186,9 @@ def _border_of(codes: PixelArray) -> str:
         def width(lines: PixelArray, color: Float64Array = color) -> int:
             for k, line in enumerate(lines):
                 if not (np.abs(line - color) <= tolerance).all():
-                    return k
+                    # A little further in, beyond what JPEG smears.
+                    beyond = np.abs(lines[min(k + 2, len(lines) - 1)] - color) > tolerance
+                    return k if beyond.any(axis=-1).mean() > 0.5 else 0
             return 0  # nothing else is there
 
         widths = [width(turned), width(turned[::-1])]
