@@ -20,8 +20,8 @@ import torch
 from benchmarks.measure import flags
 from benchmarks.scenes import is_for_fitting, panoramas_of
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import GAMMA
-from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance, expose
+from warpir.core.color import GAMMA, expose
+from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance
 from warpir.io.images.photos import read_envmap
 from warpir.look.response import PLACED, Response, estimate_response, statistics
 from warpir.train.photo_look import Look, draw_faults, draw_looks

@@ -25,10 +25,10 @@ import numpy as np
 from benchmarks.measure import flags, write_json
 from benchmarks.scenes import panoramas_of
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import gamma_to_linear
+from warpir.core.color import expose, gamma_to_linear
 from warpir.core.errors import InputError
 from warpir.core.latlong import look_up
-from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance, expose
+from warpir.evaluate.scenes import CAMERA_HEIGHT, crop_camera, crop_radiance
 from warpir.io.images.photos import read_envmap
 from warpir.look.ground_coat import GroundCoat, estimate_coat
 from warpir.scene.camera import Camera

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.scenes import write_picture
-from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
+from warpir.core.color import expose
+from warpir.evaluate.scenes import crop_camera, crop_radiance
 from warpir.io.images.photos import read_envmap
 from warpir.scene.camera import Camera
 

@@ -24,9 +24,9 @@ from benchmarks.measure import context, flags, rms, table, write_json
 from benchmarks.scenes import on_the_ground, write_picture
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import gamma_to_linear, luminance
+from warpir.core.color import expose, gamma_to_linear, luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
-from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
+from warpir.evaluate.scenes import crop_camera, crop_radiance
 from warpir.io.assets import load_asset
 from warpir.io.images.photos import read_envmap
 from warpir.optimize.light import LightOptimization, Unknowns

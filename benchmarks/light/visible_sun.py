@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from benchmarks.measure import flags, write_json
 from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import linear_to_gamma, luminance
+from warpir.core.color import expose, linear_to_gamma, luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.light_errors import light_errors
@@ -35,7 +35,6 @@ from warpir.evaluate.scenes import (
     Subject,
     crop_camera,
     crop_radiance,
-    expose,
     with_surface,
 )
 from warpir.evaluate.stage import Prediction, Quality, Stage, unseen_by

@@ -22,8 +22,8 @@ from scipy import ndimage
 
 from benchmarks.look import draw_camera, softness
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
-from warpir.core.color import codes_of, gamma_to_linear, linear_to_gamma
-from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance, expose
+from warpir.core.color import codes_of, expose, gamma_to_linear, linear_to_gamma
+from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance
 from warpir.io.images.photos import read_envmap
 from warpir.look.grain import Grain
 from warpir.look.sharpness import gaussian

@@ -14,6 +14,7 @@ from tests.builders.shapes import a_camera
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.config import InsertConfig
 from warpir.core.arrays import FloatArray
+from warpir.core.color import expose
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.evaluate.command import main
@@ -37,7 +38,6 @@ from warpir.evaluate.scenes import (
     Subject,
     crop_camera,
     crop_radiance,
-    expose,
     find_files,
     mirrored,
 )

@@ -9,8 +9,9 @@ from PIL import Image
 
 from benchmarks.light.panorama_crop import write_crop
 from warpir.app.command import parse
+from warpir.core.color import expose
 from warpir.core.latlong import look_up, map_directions
-from warpir.evaluate.scenes import crop_camera, crop_radiance, expose
+from warpir.evaluate.scenes import crop_camera, crop_radiance
 from warpir.io.cameras.reader import read_camera
 from warpir.scene.light import angles_from_axis, axis_from_angles
 

@@ -10,6 +10,8 @@ from tests.builders.shapes import a_regression, box_before, camera, even_ambient
 from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import FloatArray
+from warpir.core.color import linear_to_gamma
+from warpir.io.images.photos import Photo
 from warpir.lighting import estimate, exposure
 from warpir.lighting.estimate import estimate_light
 from warpir.lighting.exposure import (
@@ -201,6 +203,27 @@ def test_estimate_follows_the_ground_where_its_albedo_is_stated(
         assert given.ground is None and given.record()["ground"] is None
         assert given.light.exposure == stops and len(given.light.assumed) == 1
         np.testing.assert_allclose(amplitude, 2.0**stops * plain, rtol=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1.0 / 64.0, 64.0])
+def test_plate_of_any_unit_gives_the_same_light_in_that_unit(unit: float) -> None:
+    """The networks see the plate exposed as a photo, and the ground's level is not cut."""
+
+    def estimated(factor: float) -> estimate.Estimate:
+        inputs = inputs_of(0.3)
+        shade = np.linspace(0.2, 1.0, 32, dtype=np.float32)[:, None, None]
+        plate = np.float32(factor) * shade * inputs.photo.linear()
+        photo = Photo(plate, np.clip(linear_to_gamma(plate), 0.0, 1.0), "exr")
+        config = InsertConfig(photo="p", asset="a", out="o")
+        return estimate_light(replace(inputs, photo=photo), config.light, config.tone_operator)
+
+    plain, other = estimated(1.0), estimated(unit)
+    np.testing.assert_allclose(other.regression.axis, plain.regression.axis, atol=1e-4)
+    lobes, others = plain.light.light.lobes, other.light.light.lobes
+    assert lobes is not None and others is not None
+    np.testing.assert_allclose(others.amplitude, unit * lobes.amplitude, rtol=1e-3)
+    assert plain.ground is not None and other.ground is not None
+    assert other.ground.implied == pytest.approx(plain.ground.implied, rel=1e-3)
 
 
 def test_a_glimpse_of_the_ground_is_not_enough() -> None:

@@ -189,6 +189,33 @@ def test_foreground_is_the_tone_mapped_radiance(device: str) -> None:
 
 
 @pytest.mark.parametrize("tone", ["reinhard", "linear"])
+def test_object_on_a_linear_plate_exceeds_one_where_a_photo_clips(device: str, tone: str) -> None:
+    """Without an operator radiance above 1 stays; everything else is as on a photo."""
+    codes = photo().linear()
+    plate = Photo(codes, photo().srgb, "exr")
+    light, curves = sunny().scaled(4.0), bent(tone)
+    on_photo, layers = (
+        make_picture(renderer(device), light, light, p, QUALITY, curves).layers
+        for p in (photo(), plate)
+    )
+    found, clipped = layers.foreground, on_photo.foreground
+    if tone == "reinhard":
+        np.testing.assert_array_equal(found, clipped)
+        return
+    r = renderer(device)
+    objects = r.gbuffer(QUALITY.seed).object_pixels
+    args = light_args(light, r.device)
+    out = r.foreground(args, objects, QUALITY.samples, QUALITY.rays, QUALITY.depth, QUALITY.seed)
+    bright = out.radiance > out.mask[:, None]
+    assert bright.sum() > 20
+    shown = found.reshape(-1, 4)[objects, :3]
+    np.testing.assert_allclose(shown[bright], out.radiance[bright], rtol=1e-6)
+    np.testing.assert_array_equal(shown[~bright], clipped.reshape(-1, 4)[objects, :3][~bright])
+    parts = sum(getattr(layers, name) for name in ("diffuse", "specular", "emission"))
+    np.testing.assert_allclose(parts, found[..., :3], rtol=1e-3, atol=PART)
+
+
+@pytest.mark.parametrize("tone", ["reinhard", "linear"])
 def test_parts_add_up_to_the_foreground(device: str, tone: str) -> None:
     """Diffuse + specular + emission = foreground, each at least 0, each where it should be."""
     layers = picture(device, bent(tone)).layers

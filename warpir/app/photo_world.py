@@ -174,7 +174,7 @@ def _estimated(
     sources = dict(camera.sources)
     is_known = sources["vfov_deg"].name != ASSUMED
     fov = math.degrees(2.0 * math.atan(camera.height / 2.0 / camera.fy))
-    found = estimator(photo.srgb, fov if is_known else None)
+    found = estimator(photo.exposed()[0], fov if is_known else None)
     focal, centre = camera.fy, camera.cy
     if not is_known:
         focal = camera.height / 2.0 / math.tan(math.radians(round(found.vfov_deg, 1)) / 2.0)

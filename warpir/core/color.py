@@ -23,6 +23,9 @@ REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 GAMMA = 2.2
 """Exponent of DiPIR's transfer function [1] (supplement, section B)."""
 
+WHITE_PERCENTILE, WHITE = 99.0, 0.9
+"""An exposed photo shows this percentile of its encoded values above 0 [%] as this value [1]."""
+
 XYZ_TO_REC709 = np.array(
     [
         [3.2409699419, -1.5373831776, -0.4986107603],
@@ -129,6 +132,19 @@ def gamma_to_linear(encoded: AnyFloatArray) -> AnyFloatArray:
 def linear_to_gamma(linear: AnyFloatArray) -> AnyFloatArray:
     """Encode the composite as DiPIR does: ``linear ** (1 / 2.2)``, negative values as 0."""
     return np.maximum(linear, 0) ** linear.dtype.type(1.0 / GAMMA)
+
+
+def expose(radiance: AnyFloatArray) -> tuple[AnyFloatArray, float]:
+    """Expose radiance as a photograph (as the estimators' training and evaluation do).
+
+    Returns:
+        Display-encoded values in [0, 1], of the same shape, and the exposure [EV]. What is black
+        everywhere stays so.
+    """
+    encoded = linear_to_gamma(radiance)
+    seen = encoded[encoded > 0.0]
+    alpha = WHITE / float(np.percentile(seen, WHITE_PERCENTILE)) if seen.size else 1.0
+    return np.clip(alpha * encoded, 0.0, 1.0), float(GAMMA * np.log2(alpha))
 
 
 def codes_of(encoded: AnyFloatArray) -> CodeArray:

@@ -24,7 +24,7 @@ from typing import TypeVar
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import GAMMA, gamma_to_linear, linear_to_gamma, luminance
+from warpir.core.color import expose, gamma_to_linear, linear_to_gamma, luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.io.assets import load_asset
@@ -64,10 +64,6 @@ SUNNY_PEAK = 3000.0
 """Least peak of a sunny place over its mean: lamps and soft boxes are larger than a sun [1]."""
 MATERIALS = {"diffuse": (0.0, 1.0), "glossy": (1.0, 0.3)}
 """Metallic and roughness of the two objects of a place; their colours are the asset's own."""
-WHITE_PERCENTILE = 99.0
-"""Percentile of the encoded values that becomes `WHITE` [%]."""
-WHITE = 0.9
-"""Display value of that percentile [1]."""
 
 
 # ------------------------------------------------------------------------- views of a panorama
@@ -112,13 +108,6 @@ def crop_radiance(texels: FloatArray, camera: Camera, side: int = 2) -> Float64A
             directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
             total += look_up(texels, directions)
     return total / side**2
-
-
-def expose(radiance: Float64Array) -> tuple[Float64Array, float]:
-    """Return the photo's display values, shape [height, width, 3], and its exposure [EV]."""
-    encoded = linear_to_gamma(radiance)
-    alpha = WHITE / float(np.percentile(encoded[encoded > 0.0], WHITE_PERCENTILE))
-    return np.clip(alpha * encoded, 0.0, 1.0), float(GAMMA * np.log2(alpha))
 
 
 # ------------------------------------------------------------------------ the camera's response

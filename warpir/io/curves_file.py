@@ -4,9 +4,10 @@
      "foreground": {"x": [[0, ..., 1]], "y": [[0, ..., 1]], "slope": [[1, ..., 1]]},
      "shadow_ratio": {...}, "response": {...}}
 
-``tone`` is the operator between radiance and the foreground's curve. ``response`` is there where
-the picture repeats a camera's response (`warpir.look.response`), which follows both; it belongs to
-the picture, is estimated from each photo, and is not read back.
+``tone`` is the operator between radiance and the foreground's curve. ``is_clipped``, default true,
+is false on a linear plate: without an operator, radiance above 1 is shown as it is. ``response`` is
+there where the picture repeats a camera's response (`warpir.look.response`), which follows both; it
+belongs to the picture, is estimated from each photo, and is not read back.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ END_TOLERANCE = 1e-6
 def curves_to_json(curves: Curves, response: ToneKnots | None = None) -> dict[str, Any]:
     """Return what `read_curves` reads, and the response that follows the curves."""
     content: dict[str, Any] = {"format": "warpir-curves", "version": VERSION, "tone": curves.tone}
+    if not curves.is_clipped:
+        content["is_clipped"] = False
     written = {name: getattr(curves, name) for name in CURVE_COUNTS}
     if response is not None:
         written["response"] = response
@@ -61,7 +64,10 @@ def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
         given = len(knots[name].x)
         if given != count:
             raise InputError(path, f"/{name}: curves miscounted (found {given}; expected {count})")
-    return Curves(str(tone), knots["foreground"], knots["shadow_ratio"])
+    is_clipped = root.get("is_clipped", True)
+    if not isinstance(is_clipped, bool):
+        raise InputError(path, f"/is_clipped: true or false expected (found {is_clipped!r:.40})")
+    return Curves(str(tone), knots["foreground"], knots["shadow_ratio"], is_clipped)
 
 
 def _read_knots(path: str | Path, pointer: str, value: Any) -> ToneKnots:

@@ -101,6 +101,8 @@ def _write_curves(output: OutputFolder, curves: Curves, response: ToneKnots | No
         about = "what the tone curve gives -> fg.RGB of layers.exr, coverage divided out"
         output.write_bytes(RESPONSE, tone_curve_cube(response, about))
     about = f"{_RADIANCE[curves.tone]} -> {of_object}"
+    if curves.tone == "linear" and not curves.is_clipped:
+        about += "; radiance above 1 stays as it is"
     output.write_bytes(OBJECT_CURVE, tone_curve_cube(curves.foreground, about))
     about = f"shadow ratio clipped to [0, 1] -> {of_shadow}"
     output.write_bytes(SHADOW_CURVE, tone_curve_cube(curves.shadow_ratio, about))

@@ -45,16 +45,19 @@ def estimate_light(
 ) -> Estimate:
     """Estimate the light of the photo with the regressor, and check its level by the ground.
 
-    What the regressor sees in the photo may be given where it is known.
+    What the regressor sees in the photo as `Photo.exposed` may be given where it is known.
 
     Raises:
         InputError: The weights are absent or damaged (`ExitCode.MODEL`).
     """
     path = None if asked.regressor is None else Path(asked.regressor)
+    shown, gain_of_photo = inputs.photo.exposed()
     if regression is None:
-        regression = regress(load_regressor(path), inputs.photo.srgb, inputs.camera)
+        regression = regress(load_regressor(path), shown, inputs.camera)
     if asked.visible_sun:
-        regression = with_visible_sun(regression, inputs.photo.srgb, inputs.camera)
+        regression = with_visible_sun(regression, shown, inputs.camera)
+    if gain_of_photo != 1.0:
+        regression = regression.scaled(1.0 / gain_of_photo)
     stops, ground = asked.exposure, None
     assumed = [_describe_direction(regression)]
     if stops is None:

@@ -26,6 +26,7 @@ from warpir.core.color import luminance
 from warpir.lighting.regression import LOG_STD_MAX, Regression
 from warpir.lighting.scene_light import (
     GROUND_PERCENTILE,
+    believed,
     foot_of,
     lit_ground,
     photo_luminance,
@@ -54,8 +55,6 @@ REACH_OBJECT = 1.5
 """Or up to this one, in distances of the object, where that is further [1]."""
 LEAST_SEEN = 0.02
 """Share of the looks at the photo that must meet the ground to ask it [1]."""
-LEVELS = (1e-3, 0.9)
-"""Darkest and brightest level of the ground that a photo is believed to show [1]."""
 LOG_FACTOR_MAX = 4.0
 """Greatest logarithm of the factor [1]."""
 
@@ -114,7 +113,7 @@ def ask_ground(
     irradiance = float(luminance(light.irradiance(normal)))
     if len(seen) < LEAST_SEEN * looks or not irradiance > 0.0:
         return None
-    level = float(np.clip(np.percentile(seen, GROUND_PERCENTILE), *LEVELS))
+    level = believed(float(np.percentile(seen, GROUND_PERCENTILE)), inputs.photo)
     implied = math.pi * level / irradiance
     log_std = DOUBT * level_log_std(regression, normal)
     if stated is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,13 @@ class Regression:
         cosine = float(np.maximum(self.directions @ normal, 0.0) @ self.probability)
         rest: Float64Array = Light(lobes=self.ambient).irradiance(normal)
         return cosine * self.sun + rest
+
+    def scaled(self, factor: float) -> Regression:
+        """Return all of the light in another unit."""
+        ambient = self.ambient.amplitude * np.float32(factor)
+        return replace(
+            self, sun=self.sun * factor, ambient=replace(self.ambient, amplitude=ambient)
+        )
 
     @property
     def is_clear(self) -> bool:

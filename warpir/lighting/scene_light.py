@@ -11,6 +11,7 @@ from warpir.app.settings import LightConfig
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import luminance
 from warpir.core.errors import InputError
+from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LobeFit, fit_lobes
 from warpir.scene.lamps import lamp_axes, without_lamps
 from warpir.scene.light import Light, plain_sky, sun_lobe
@@ -30,6 +31,8 @@ SUN_TO_SKY = 5.0
 """Irradiance of a surface facing the sun over that from a clear sky on the ground [1]."""
 GROUND_PERCENTILE = 50.0
 """Of the ground round the object: the level of an even light (the authors state none)."""
+LEVELS = (1e-3, 0.9)
+"""Darkest and brightest level of the ground that a photo is believed to show [1]."""
 LIT_PERCENTILE = 75.0
 """The brighter quarter of the ground round the object stands for ground that is not in shadow."""
 LEAST_FROM_AFAR = 0.05
@@ -110,8 +113,24 @@ def _even(inputs: Inputs, tone: str) -> SceneLight:
 
 def start_level(inputs: Inputs, tone: str) -> float:
     """Return the radiance of an even light under which white ground looks as the photo's does."""
-    level = float(np.clip(_level(inputs, _ring(inputs), GROUND_PERCENTILE), 1e-3, 0.9))
-    return level / (1.0 - level) if tone == "reinhard" else level
+    level = believed(_level(inputs, _ring(inputs), GROUND_PERCENTILE), inputs.photo)
+    return _radiance(level, tone)
+
+
+def believed(level: float, photo: Photo) -> float:
+    """Return a level of the ground as far as a photo can show it [1]; a linear plate shows all."""
+    low, high = LEVELS
+    if photo.is_linear:
+        return max(level, low / photo.exposed()[1])
+    return min(max(level, low), high)
+
+
+def _radiance(level: float, tone: str) -> float:
+    """Return what the tone operator shows as a level; Reinhard's never shows more than `LEVELS`."""
+    if tone != "reinhard":
+        return level
+    level = min(level, LEVELS[1])
+    return level / (1.0 - level)
 
 
 def _reused(run: EarlierRun, asked: LightConfig) -> SceneLight:
@@ -169,9 +188,8 @@ def _automatic_exposure(light: Light, inputs: Inputs, asked: LightConfig, tone: 
             "no light reaches the ground, so no exposure follows from the photo",
             "give --exposure",
         )
-    level = np.clip(_level(inputs, points, LIT_PERCENTILE), 1e-3, 0.9)
-    wanted = level / (1.0 - level) if tone == "reinhard" else level
-    received = wanted * np.pi / asked.assumed_albedo
+    level = believed(_level(inputs, points, LIT_PERCENTILE), inputs.photo)
+    received = _radiance(level, tone) * np.pi / asked.assumed_albedo
     left = received - _by_lamps(inputs, points)
     return float(np.log2(max(left, LEAST_FROM_AFAR * received) / from_afar))
 

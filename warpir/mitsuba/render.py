@@ -417,6 +417,8 @@ def render_run(
     share = np.where(coverage > 0.0, coverage, 1.0)
 
     def tone(radiance: Float64Array) -> Float64Array:
+        if not curves.is_clipped:
+            return curves.shown(radiance)
         x = radiance / (1.0 + radiance) if curves.tone == "reinhard" else radiance
         return curves.foreground.evaluate(x)[..., 0]
 

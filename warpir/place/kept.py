@@ -63,7 +63,7 @@ class Kept(Loaders):
         return replace(inputs, asset=self._thin[1])
 
     def regression(self, config: InsertConfig, camera: Camera) -> Regression:
-        """Return the light that the regressor sees in the photo, by a camera of its size.
+        """Return the light that the regressor sees in the photo, exposed, by its camera.
 
         Raises:
             InputError: The photo or the weights cannot be read.
@@ -86,7 +86,7 @@ class Kept(Loaders):
 
         camera = Camera(*lens, np.reshape(pose, (4, 4)))
         network = load_regressor(None if weights is None else Path(weights))
-        return regress(network, self._read(*photo).srgb, camera)
+        return regress(network, self._read(*photo).exposed()[0], camera)
 
 
 def _key(asked: InputConfig, limits: Limits) -> PhotoKey:

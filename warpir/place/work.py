@@ -61,8 +61,8 @@ def estimated_light(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
 
     config, camera = InsertConfig(**read_values(job["config"])), camera_of(job["camera"])
     found = KEPT.regression(config, camera)
-    photo = KEPT.photo(config.inputs, config.limits)
-    return light_record(with_visible_sun(found, photo.srgb, camera))
+    shown, gain = KEPT.photo(config.inputs, config.limits).exposed()
+    return light_record(with_visible_sun(found, shown, camera).scaled(1.0 / gain))
 
 
 def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:

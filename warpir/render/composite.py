@@ -67,9 +67,10 @@ def make_picture(
 ) -> Picture:
     """Render object and shadow at the scene camera's resolution and put them into the photo.
 
-    The arguments are those of `render` and `composite`.
+    The arguments are those of `render` and `composite`. On a linear plate the object does not end
+    at 1 either.
     """
-    lights = light_fg, light_shadow
+    curves, lights = replace(curves, is_clipped=not photo.is_linear), (light_fg, light_shadow)
     rendering = render(renderer, *lights, quality, curves, shadow_mask=shadow_mask, behind=behind)
     return composite(rendering, photo, quality.seed, occluder, look)
 

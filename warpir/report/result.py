@@ -235,6 +235,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
     maps, response = _maps_of(light), picture.look.response
     knots = None if response is None else response.knots()
+    light = replace(light, curves=replace(light.curves, is_clipped=not photo.is_linear))
     output.write_json("curves.json", curves_to_json(light.curves, knots))
     output.write_json("camera.json", inputs.camera.record())
     # Compression takes most of the time.

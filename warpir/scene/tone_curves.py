@@ -132,6 +132,9 @@ class Curves:
     """One curve."""
     shadow_ratio: ToneKnots
     """Three curves, red, green and blue."""
+    is_clipped: bool = True
+    """Whether the object ends at 1 where there is no operator, as in a photo; not on a linear
+    plate."""
 
     def radiance(self, photo_lin: AnyFloatArray) -> Float64Array:
         """Return the radiance that the foreground's curve and operator show as these values.

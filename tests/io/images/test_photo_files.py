@@ -5,6 +5,7 @@ import os
 import re
 import struct
 import tracemalloc
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -531,6 +532,20 @@ def test_e11_plates_are_divided_by_their_exposure(tmp_path: Path) -> None:
     path = write_image(tmp_path / "p.hdr", np.full((8, 12, 3), 0.5, np.float32))
     path.write_bytes(path.read_bytes().replace(b"FORMAT", b"EXPOSURE=4.0\nFORMAT", 1))
     np.testing.assert_array_equal(read_photo(path).linear(), np.float32(0.125))
+
+
+def test_plate_is_exposed_for_the_estimators(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The 99th percentile shows as .9, whatever the plate's unit; a photograph stays as it is."""
+    plate = rng.uniform(0.0, 30.0, (40, 50, 3)).astype(np.float32)
+    photo = read_photo(write_image(tmp_path / "p.exr", plate))
+    shown, factor = photo.exposed()
+    assert np.percentile(shown, 99.0) == pytest.approx(0.9, abs=1e-3)
+    unclipped = shown < 1.0
+    np.testing.assert_allclose(shown[unclipped] ** 2.2, factor * plate[unclipped], rtol=1e-3)
+    black = replace(photo, codes=np.zeros_like(plate))
+    assert black.exposed()[1] == 1.0 and not black.exposed()[0].any()
+    codes = replace(photo, codes=np.zeros((40, 50, 3), np.uint8))
+    assert codes.exposed() == (codes.srgb, 1.0)
 
 
 @pytest.mark.case("I12")

@@ -61,6 +61,19 @@ class Photo:
         """Whether the codes have more than 8 bits, so that half floats would lose some."""
         return self.codes.dtype.itemsize > 1
 
+    def exposed(self) -> tuple[FloatArray, float]:
+        """Return what the estimators look at, and by what its light is to be divided.
+
+        A photograph is as it is. A linear plate of any unit is exposed as their photographs are.
+
+        Returns:
+            Display-encoded values in [0, 1], shape [H, W, 3], and the factor on radiance [1].
+        """
+        if not self.is_linear:
+            return self.srgb, 1.0
+        exposed, stops = color.expose(self.codes)
+        return exposed, 2.0**stops
+
     def linear(self, where: Any = ...) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from warpir.core.arrays import FloatArray
@@ -26,8 +27,8 @@ def tone_mapped(
         curves: Tone curves and operator.
 
     Returns:
-        The object, not premultiplied [1], shape [object_pixel, 3], and what the plate is multiplied
-        by [1], shape [receiver_pixel, 3].
+        The object, not premultiplied [1], shape [object_pixel, 3], above 1 where its curves do not
+        clip; and what the plate is multiplied by [1], shape [receiver_pixel, 3].
     """
     objects, receivers = len(foreground.mask), len(ratio)
     fg = renderer.zeros(objects, wp.vec3)
@@ -56,4 +57,9 @@ def tone_mapped(
         ],
         1,
     )
-    return fg.numpy()[:objects], shadow.numpy()[:receivers]
+    shown = fg.numpy()[:objects]
+    if not curves.is_clipped and curves.tone == "linear":
+        share = np.where(foreground.mask > 0.0, foreground.mask, np.inf)
+        radiance = foreground.radiance / share[:, None]
+        shown = np.where(radiance > 1.0, radiance, shown)
+    return shown, shadow.numpy()[:receivers]
