@@ -3,12 +3,21 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from tests.builders.image_files import write_envmap
+from tests.lighting.test_regressor import HELD_OUT, SMALL, TOY, blobs
 from warpir.core.errors import ExitCode
+from warpir.train import command
 from warpir.train.command import main
+from warpir.train.networks.regressor import random_regressor, save_regressor
+from warpir.train.places import learned_from
+from warpir.train.regressor import train_regressor
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -103,3 +112,31 @@ def test_training_looks_before_it_begins(
     assert main(argv) == code
     assert words in capsys.readouterr().err.splitlines()[0]
     assert held.is_dir() and not (tmp_path / "new").exists()
+
+
+def test_what_is_resumed_knows_what_it_began_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folds stay, and its record still names the panoramas behind the weights of --start."""
+    start, out = tmp_path / "start.safetensors", tmp_path / "out"
+    network = random_regressor(0, SMALL)
+    save_regressor(network, start, {"panoramas": ["old_noon", "older_noon"]})
+    for place in ("old", "a", "b", "c", "d"):
+        texels = np.full((16, 32, 3), 0.5, np.float32)
+        write_envmap(tmp_path / f"{place}_noon", f"{place}_noon", texels)
+    records: list[dict[str, Any]] = []
+
+    def taken(*given: Any) -> dict[str, Any]:
+        records.append(given[-1])
+        tiny = replace(TOY, batch=2, step_limit=1)
+        end = train_regressor(
+            blobs, HELD_OUT, out, tiny, "cpu", 1.0, 1.0, given[1].resume, 0, network, records[-1]
+        )
+        return vars(end)
+
+    monkeypatch.setattr(command, "_train_on", taken)
+    argv = ["regressor", "--panoramas", str(tmp_path), "--out", str(out), "--device", "cpu"]
+    for more in (["--start", str(start)], ["--resume"]):
+        assert main([*argv, "--fold", "0/3", *more]) == ExitCode.DONE
+    assert records[0]["validation_panoramas"] and records[0] == records[1]
+    assert "older_noon" in learned_from(records[1])

@@ -6,9 +6,9 @@ r"""Train the networks that warpir ships: for the light, and for the camera.
         --fold 0/5
 
 Scenes are rendered as they are needed and then forgotten. A command stops after ``--minutes``, and
-``--resume`` goes on until ``--total-minutes`` are used up. With torchrun a network is trained on
-several cards. ``--without`` names panoramas that must not be learned from; of those that
-``--validation`` names only the errors are looked at.
+``--resume`` goes on, with the same panoramas, until ``--total-minutes`` are used up. With torchrun
+a network is trained on several cards. ``--without`` names panoramas that must not be learned from;
+of those that ``--validation`` names only the errors are looked at.
 """
 
 from __future__ import annotations
@@ -106,13 +106,14 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
 
     from warpir.render.device import choose_device
     from warpir.train.lights import load_panoramas
-    from warpir.train.places import of_fold, some_places
+    from warpir.train.places import learned_from, of_fold, some_places
     from warpir.train.worker import Worker
 
     worker = Worker.this()
     device = f"cuda:{worker.local_rank}" if worker.count > 1 else choose_device(options.device)
     names = [p.stem for p in panoramas if p.stem not in options.without]
-    known = _places_of(options)
+    began_with = _began_with(options)
+    known = learned_from(began_with)
     watched_names = {*options.validation, *of_fold(names, options.fold, known)}
     kept_out = {*options.without, *watched_names}
     kept_out |= {*names} - some_places(
@@ -128,6 +129,7 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
         "validation_panoramas": [p.stem for p in watched],
         "kept_out": list(options.without),
         "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
+        "started_from": began_with,
     }
     pools = load_panoramas(learned, torch_device), load_panoramas(watched, torch_device)
     return _train_on(pools, options, options.seed * 1000 + worker.local_rank, torch_device, record)
@@ -185,14 +187,19 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     )
 
 
-def _places_of(options: argparse.Namespace) -> set[str]:
-    """Return the panoramas that the regressor to start from has learned from."""
-    if options.start is None or options.network != "regressor":
-        return set()
-    from warpir.lighting.regressor import load_regressor
-    from warpir.train.places import learned_from
+def _began_with(options: argparse.Namespace) -> Mapping[str, Any]:
+    """Return the record of the regressor that this training began with; empty without any."""
+    if options.resume:
+        from warpir.train.regressor import checkpoints_of
 
-    return learned_from(load_regressor(options.start).record)
+        # `train_regressor` tells of checkpoints that are damaged.
+        held = checkpoints_of(options.out).load(lambda _: None).state
+        return held.get("record", {}).get("started_from", {})  # type: ignore[no-any-return]
+    if options.start is None:
+        return {}
+    from warpir.lighting.regressor import load_regressor
+
+    return load_regressor(options.start).record
 
 
 def _fold(text: str) -> tuple[int, int]:
@@ -276,8 +283,6 @@ def _train_on(
         compile=not options.no_compile,
     )
     start = None if options.start is None else read_regressor(options.start, device)
-    if start is not None:
-        record = record | {"started_from": start.record}
     end = train_regressor(
         Replay(scenes.next_batch, REPLAYS, REPLAYED),
         validation,

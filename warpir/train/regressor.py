@@ -96,15 +96,17 @@ def train_regressor(
         record: Put into the weights file beside what is known here; plain values.
 
     Raises:
-        InputError: Nothing to resume from, or no checkpoint that is whole.
+        InputError: Nothing to resume from, no checkpoint that is whole, or one of a training on
+            other panoramas.
     """
     began, device, worker = time.monotonic(), torch.device(device), Worker.this()
     with worker.joined(device):
         out.mkdir(parents=True, exist_ok=True)
         if resume:
-            run = _Run.resumed(out, settings, device)
+            run = _Run.resumed(out, settings, device, record or {})
         else:
-            run = _Run(out, network or random_regressor(seed), settings, device)
+            start = network or random_regressor(seed)
+            run = _Run(out, start, settings, device, record or {})
             if worker.is_first:
                 (out / CURVE).unlink(missing_ok=True)
         first = run.step
@@ -165,8 +167,9 @@ class _Run:
         network: RegressorModule,
         settings: TrainingSettings,
         device: str | torch.device,
+        record: Mapping[str, Any],
     ) -> None:
-        self.out = out
+        self.out, self.record = out, record
         self.network = network.to(device).requires_grad_(True)
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
         self.loss = LightLoss(self.network, settings.label_sigma_deg)
@@ -179,15 +182,26 @@ class _Run:
         """Running means of the terms of the loss."""
 
     @classmethod
-    def resumed(cls, out: Path, settings: TrainingSettings, device: torch.device) -> _Run:
+    def resumed(
+        cls,
+        out: Path,
+        settings: TrainingSettings,
+        device: torch.device,
+        record: Mapping[str, Any],
+    ) -> _Run:
         """Read the newest whole checkpoint back.
 
         Raises:
-            InputError: There is none.
+            InputError: There is none, or it has learned from or is judged by other panoramas.
         """
         held = checkpoints_of(out).load(log.warning).state
+        for name in ("panoramas", "validation_panoramas"):
+            was, now = (set(r.get(name, ())) for r in (held.get("record", {}), record))
+            if was != now:
+                what = f"a training with other {name} ({', '.join(sorted(was ^ now))})"
+                raise InputError(out, what, "give the same again, or choose another --out")
         config = RegressorConfig(**plain_sizes(held["config"]))
-        run = cls(out, RegressorModule(config), settings, device)
+        run = cls(out, RegressorModule(config), settings, device, record)
         run.network.load_state_dict(held["weights"])
         run.average.load_state_dict(held["average"])
         run.step, run.minutes = held["step"], held["minutes"]
@@ -298,6 +312,7 @@ class _Run:
         moments = {k: self.optimizer.state[p] for k, p in self.network.named_parameters()}
         state = {
             "config": asdict(self.network.config),
+            "record": self.record,
             "weights": self.network.state_dict(),
             "average": self.average.state_dict(),
             "first": {k: m["exp_avg"] for k, m in moments.items()},
