@@ -78,6 +78,41 @@ def test_command_refuses_what_cannot_be_meant(
     assert "no such folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("network", "given", "named"),
+    [
+        ("camera", ["--total-minutes", "9"], "--total-minutes"),
+        ("camera", ["--networks", "2"], "--networks"),
+        ("camera", ["--places", "4"], "--places"),
+        ("camera", ["--start", "a", "--regressor", "b"], "--regressor"),
+        ("regressor", ["--regressor", "a"], "--regressor"),
+        ("regressor", ["--networks", "2", "--fold", "0/5"], "--fold"),
+        ("regressor", ["--networks", "0"], "--networks"),
+        ("regressor", ["--seed", "-1"], "--seed"),
+    ],
+)
+def test_flags_that_would_do_nothing_are_refused(
+    network: str, given: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = [network, "--panoramas", str(tmp_path), "--out", str(tmp_path / "out"), *given]
+    assert main(argv) == ExitCode.USAGE
+    assert capsys.readouterr().err.startswith(f"error: {named}: ")
+
+
+@pytest.mark.parametrize(("given", "rate"), [([], 1.2e-3), (["--rate", "1e-4"], 1e-4)])
+def test_the_cameras_training_heeds_its_rate(
+    given: list[str], rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rates = []
+    monkeypatch.setattr(
+        "warpir.train.camera.loop.train_camera", lambda *a, **_: rates.append(a[3].learning_rate)
+    )
+    write_envmap(tmp_path / "place", "place", np.full((16, 32, 3), 0.5, np.float32))
+    argv = ["camera", "--panoramas", str(tmp_path), "--out", str(tmp_path / "out"), *given]
+    assert main([*argv, "--device", "cpu"]) == ExitCode.DONE
+    assert rates == [rate]
+
+
 @pytest.mark.case("F5")
 @pytest.mark.parametrize(
     ("given", "code", "words"),

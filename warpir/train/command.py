@@ -59,8 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--minutes", type=float, default=9.0, help="of this command")
     add("--total-minutes", type=float, help="of all commands together")
     add("--batch", type=int, default=None)
-    words = "largest learning rate (default: 1e-3; 3e-4 suits weights to begin with)"
-    add("--rate", type=float, metavar="R", help=words)
+    words = "largest learning rate (default: 1e-3, with --start 3e-4 suits; camera: 1.2e-3, half of"
+    add("--rate", type=float, metavar="R", help=f"{words} it with weights to begin with)")
     add("--seed", type=int, default=0)
     add("--device", default=None)
     add("--resume", action="store_true")
@@ -78,9 +78,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: list[str]) -> int:
-    options = _parser().parse_args(arguments)
-    if options.resume and options.start is not None:
-        raise usage("--start", "what is resumed has its own weights")
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    _refuse_idle(options, parser)
     if options.networks > 1:
         return _train_members(options, arguments)
     _check(options)
@@ -172,7 +172,8 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     }
     settings = CameraSettings(
         batch=options.batch or CameraSettings.batch,
-        learning_rate=CameraSettings.learning_rate * (1.0 if start is None else 0.5),
+        learning_rate=options.rate
+        or CameraSettings.learning_rate * (1.0 if start is None else 0.5),
     )
     return train_camera(
         read_panoramas(learned, device),
@@ -210,6 +211,24 @@ def _fold(text: str) -> tuple[int, int]:
     return int(fold), int(count)
 
 
+def _refuse_idle(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Refuse flags that would do nothing.
+
+    Raises:
+        InputError: One is given (exit 2).
+    """
+    is_camera = options.network == "camera"
+    for name in ("total_minutes", "networks", "places") if is_camera else ("regressor",):
+        if getattr(options, name) != parser.get_default(name):
+            raise usage(f"--{name.replace('_', '-')}", f"not for the {options.network}'s network")
+    if options.start is not None and options.resume:
+        raise usage("--start", "what is resumed has its own weights")
+    if options.start is not None and options.regressor is not None:
+        raise usage("--regressor", "the weights of --start have first layers of their own")
+    if options.networks > 1 and options.fold is not None:
+        raise usage("--fold", "each of --networks has its own")
+
+
 def _check(options: argparse.Namespace) -> None:
     """Find what is wrong with numbers and folders before scenes are made, which takes minutes.
 
@@ -221,8 +240,10 @@ def _check(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and not 0.0 < value < math.inf:
             raise usage(f"--{name.replace('_', '-')}", f"expected above 0 (found {value})")
-    if options.batch is not None and options.batch < 1:
-        raise usage("--batch", f"expected at least 1 (found {options.batch})")
+    for name, least in (("batch", 1), ("places", 1), ("networks", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise usage(f"--{name}", f"expected at least {least} (found {value})")
     for name in ("start", "regressor"):
         path = getattr(options, name)
         if path is not None and not path.is_file():
