@@ -149,6 +149,17 @@ def test_training_looks_before_it_begins(
     assert held.is_dir() and not (tmp_path / "new").exists()
 
 
+def test_training_begins_with_one_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What ships is the mean of several."""
+    start = tmp_path / "start.safetensors"
+    save_regressor(random_regressor(0, replace(SMALL, members=2)), start, {})
+    argv = ["regressor", "--panoramas", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main([*argv, "--device", "cpu", "--start", str(start)]) == ExitCode.MODEL
+    assert "holds 2 networks" in capsys.readouterr().err
+
+
 def test_what_is_resumed_knows_what_it_began_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

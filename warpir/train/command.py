@@ -200,7 +200,11 @@ def _began_with(options: argparse.Namespace) -> Mapping[str, Any]:
         return {}
     from warpir.lighting.regressor import load_regressor
 
-    return load_regressor(options.start).record
+    network = load_regressor(options.start)
+    if len(network.members) > 1:
+        what = f"holds {len(network.members)} networks, and a training begins with one"
+        raise InputError(options.start, what, code=ExitCode.MODEL)
+    return network.record
 
 
 def _fold(text: str) -> tuple[int, int]:
