@@ -149,6 +149,30 @@ def test_training_looks_before_it_begins(
     assert held.is_dir() and not (tmp_path / "new").exists()
 
 
+def test_no_training_outlives_one_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor the command: both would keep the card for the rest of their minutes."""
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\ncase "$*" in *member_0*) exit 3;; esac\nexec sleep 60\n')
+    python.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(python))
+    running: list[subprocess.Popen[bytes]] = []
+
+    def started(argv: list[str]) -> subprocess.Popen[bytes]:
+        running.append(popen(argv))
+        return running[-1]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", started)
+    argv = ["regressor", "--panoramas", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main([*argv, "--networks", "2"]) == ExitCode.INPUT
+    try:
+        assert len(running) == 2 and all(process.poll() is not None for process in running)
+    finally:
+        running[1].kill()
+
+
 def test_training_begins_with_one_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -341,8 +341,14 @@ def _train_members(options: argparse.Namespace, arguments: list[str]) -> int:
         own = ["--networks", "1", "--fold", f"{fold}/{options.networks}", "--out", str(folder)]
         commands.append([sys.executable, "-m", "warpir.train", *arguments, *own])
     running = [subprocess.Popen(command) for command in commands]
-    for folder, process in zip(folders, running, strict=True):
-        if process.wait():
-            raise InputError(folder, f"its training failed (exit {process.returncode})")
+    try:
+        for folder, process in zip(folders, running, strict=True):
+            if process.wait():
+                raise InputError(folder, f"its training failed (exit {process.returncode})")
+    finally:
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.wait()
     join_members([folder / WEIGHTS for folder in folders], options.out / WEIGHTS)
     return ExitCode.DONE
