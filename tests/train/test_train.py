@@ -123,9 +123,10 @@ def test_the_cameras_training_heeds_its_rate(
         (["--start", "no.safetensors"], ExitCode.MODEL, "no.safetensors"),
         (["--resume", "--out", "empty"], ExitCode.INPUT, "nothing to resume"),
         (["--out", "begun"], ExitCode.OUTPUT, "a training that was begun"),
+        (["--out", "done"], ExitCode.OUTPUT, "a camera's training"),
         (["--out", "file"], ExitCode.OUTPUT, "not a folder"),
     ],
-    ids=["nan", "no-time", "no-batch", "no-start", "no-state", "begun", "file"],
+    ids=["nan", "no-time", "no-batch", "no-start", "no-state", "begun", "done", "file"],
 )
 @pytest.mark.parametrize("network", ["camera", "regressor"])
 def test_training_looks_before_it_begins(
@@ -142,7 +143,9 @@ def test_training_looks_before_it_begins(
     (tmp_path / "empty").mkdir()
     held = tmp_path / "begun" / "checkpoints" / f"000001-{network}-900"
     held.mkdir(parents=True)
-    (tmp_path / "file").write_text("mine")
+    (tmp_path / "done").mkdir()
+    for name in ("file", "done/calibrator.safetensors"):
+        (tmp_path / name).write_text("mine")
     argv = [network, "--panoramas", "empty", "--out", "new", "--minutes", "1", *given]
     assert main(argv) == code
     assert words in capsys.readouterr().err.splitlines()[0]

@@ -258,6 +258,9 @@ def _check(options: argparse.Namespace) -> None:
     if begun and not options.resume:
         advice = "--resume goes on with it; or choose another --out"
         raise InputError(options.out, "holds a training that was begun", advice, ExitCode.OUTPUT)
+    if (options.out / "calibrator.safetensors").exists():  # the camera's leaves no checkpoints
+        what = "holds a camera's training"
+        raise InputError(options.out, what, "choose another --out", ExitCode.OUTPUT)
     if options.resume and not begun:
         raise InputError(options.out, "nothing to resume", "leave --resume out to begin")
 
