@@ -105,9 +105,12 @@ def test_corrected_photograph_shows_the_horizon_at_its_axis(panoramas: Path) -> 
 
 def test_panoramas_that_were_learned_from_are_left_out(tmp_path: Path) -> None:
     network = random_calibrator(0, SMALL)
-    network.record = {"panoramas": ["a"]}
+    network.record = {"panoramas": ["a"], "started_from": {"panoramas": ["old"]}}
     asked = network.calibrator()
-    fresh, notices = unlearned([tmp_path / "a.exr", tmp_path / "b.exr"], asked)
-    assert [path.stem for path in fresh] == ["b"] and "1 panoramas" in notices[0]
+    paths = [tmp_path / f"{name}.exr" for name in ("a", "b", "old")]
+    fresh, notices = unlearned(paths, asked)
+    assert [path.stem for path in fresh] == ["b"] and "2 panoramas" in notices[0]
+    network.record = {"panoramas": ["a"], "started_from": None}
+    assert len(unlearned(paths, network.calibrator())[0]) == 2
     known, notices = unlearned([tmp_path / "a.exr"], asked)
     assert [path.stem for path in known] == ["a"] and "learned from all" in notices[0]

@@ -61,7 +61,7 @@ def learned_from(record: Mapping[str, Any]) -> set[str]:
     """Return the panoramas that a network, and those it started from, have learned from.
 
     Args:
-        record: Of the network's weights (`warpir.lighting.regressor.Regressor.record`).
+        record: Of the network's weights, as `warpir.lighting.regressor.Regressor.record`.
     """
     names: set[str] = set()
     records = [record]
@@ -69,5 +69,5 @@ def learned_from(record: Mapping[str, Any]) -> set[str]:
         each = records.pop()
         names |= set(each.get("panoramas", ()))
         records += each.get("members", [])
-        records += [each["started_from"]] if "started_from" in each else []
+        records += [each["started_from"]] if each.get("started_from") else []
     return names
