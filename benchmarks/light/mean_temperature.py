@@ -1,6 +1,7 @@
-"""Calibrate the direction of the mean of several networks on places that none has learned from.
+r"""Calibrate the direction of the mean of several networks on places that none has learned from.
 
-    python -m benchmarks.light.mean_temperature HELD_OUT [--scenes 90] [--seed 31] [--write FILE]
+    python -m benchmarks.light.mean_temperature HELD_OUT --asset FILE [--scenes 90] [--seed 31] \
+        [--write FILE]
 
 Each network is calibrated alone, but the mean of their logits is flatter than each of them, so its
 68 % region is too wide. One temperature of the mean corrects that. The command prints the region's
@@ -15,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from warpir.evaluate.scenes import Places
+from warpir.evaluate.scenes import PANORAMA_SUFFIXES, Places, find_files
 from warpir.evaluate.stage import unseen_by
 from warpir.lighting.regression import regress, yaw_to_world
 from warpir.scene.light import Light, axis_from_angles, summarize
@@ -37,7 +38,8 @@ def main() -> None:
     network = trained.regressor()
     directions = trained.directions.double()
     logits, axes = defaultdict[str, list[Tensor]](list), defaultdict[str, list[Tensor]](list)
-    for place, _ in Places(options.panoramas, [options.asset], options.seed).make(options.scenes):
+    files = find_files(options.panoramas, PANORAMA_SUFFIXES, "panoramas")
+    for place, _ in Places(files, [options.asset], options.seed).make(options.scenes):
         if unseen_by(network, place.panorama) is not network:
             parser.error(f"{place.panorama}: a network has learned from it")
         peak = summarize(Light(texels=place.texels))

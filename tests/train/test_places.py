@@ -1,12 +1,16 @@
 """Folds of whole places, replayed photos and joined networks."""
 
 import itertools
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks.light import mean_temperature
+from tests.builders.image_files import write_envmap
 from tests.lighting.test_regressor import SMALL
 from warpir.evaluate.stage import unseen_by
 from warpir.lighting.regressor import Prediction, load_regressor, mixture, split
@@ -99,6 +103,21 @@ def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> N
     gap = 0.5 * (each[0].level - each[1].level)
     variance = sum(p.level_log_var.exp() for p in each) / 2.0 + gap**2
     torch.testing.assert_close(both.level_log_var, variance.log(), atol=1e-2, rtol=1e-2)
+
+
+def test_the_means_temperature_is_set_by_a_folder_of_places(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    rng: np.random.Generator,
+) -> None:
+    for place in ("here", "there"):
+        write_envmap(tmp_path / place, place, rng.random((64, 128, 3)).astype(np.float32))
+    car = Path(__file__).parents[2] / "warpir" / "demo" / "car.glb"
+    argv = ["", str(tmp_path), "--asset", str(car), "--scenes", "2"]
+    monkeypatch.setattr(sys, "argv", argv)
+    mean_temperature.main()
+    assert capsys.readouterr().out.splitlines()[-1].startswith("all: ")
 
 
 def test_a_fold_that_makes_no_sense_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
