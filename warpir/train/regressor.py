@@ -243,8 +243,9 @@ class _Run:
             seconds = worker.agree(time.monotonic() - began, self.device)
             self.minutes = earlier + seconds / 60.0
             by_steps = self.step / settings.step_limit if settings.step_limit else 0.0
-            progress = max(self.minutes / total_minutes, by_steps)
-            if progress >= 1.0 or self.minutes - earlier >= minutes:
+            progress = min(max(self.minutes / total_minutes, by_steps), 1.0)
+            # A step at least: without any there are no weights to write.
+            if self.step and (progress >= 1.0 or self.minutes - earlier >= minutes):
                 return progress >= 1.0
             with torch.no_grad():
                 batch = augment(batches(settings.batch, generator), settings, generator)
