@@ -647,11 +647,15 @@ def test_training_refuses_what_it_cannot_resume(tmp_path: Path) -> None:
         train_regressor(blobs, HELD_OUT, tmp_path, tiny, "cpu", 1.0, 1.0, resume=True)
 
 
-def test_training_takes_a_step_whatever_the_time(tmp_path: Path) -> None:
+def test_training_takes_a_step_whatever_the_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     tiny = replace(TOY, batch=2, step_limit=0)
     start = random_regressor(0, SMALL)
     end = train_regressor(blobs, HELD_OUT, tmp_path, tiny, "cpu", 1e-6, 1e-6, network=start)
     assert end.steps == 1 and (tmp_path / "regressor.safetensors").exists()
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("step 1, ") and told[1] == "calibrating the best weights"
 
 
 def test_training_goes_on_with_its_own_panoramas(tmp_path: Path) -> None:

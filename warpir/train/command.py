@@ -293,6 +293,7 @@ def _train_on(
     from warpir.train.regressor import PANORAMAS, train_regressor
     from warpir.train.scenes.generator import Mixture, SceneGenerator
     from warpir.train.stepping import TrainingSettings
+    from warpir.train.worker import Worker
 
     learned, unseen = pools
     scenes = SceneGenerator(learned, seed)
@@ -302,6 +303,8 @@ def _train_on(
         made = SceneGenerator(unseen, VALIDATION_SEED, mixture)
         return [made.photo_batch(k, 128) for k in range(VALIDATION_PICTURES // 128)]
 
+    if Worker.this().is_first:
+        say("rendering photos for validation")
     validation = {"procedural": drawn(made_up=1.0, hybrid=0.0)}
     if unseen.panorama_count:
         validation[PANORAMAS] = drawn(made_up=0.0, hybrid=0.0)

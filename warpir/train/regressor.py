@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from warpir.app.program import say
 from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
 from warpir.lighting.regressor import split
@@ -293,6 +294,8 @@ class _Run:
 
     def validate(self, validation: Mapping[str, Sequence[PhotoBatch]]) -> None:
         """Measure the average, write a line of the curve, and keep it if it is the best so far."""
+        # On a CPU it takes minutes.
+        say(f"step {self.step}, {self.minutes:.1f} minutes: validating")
         measured = {k: measure(self.average, self.loss, v) for k, v in validation.items()}
         mark = score(measured)
         line = {
@@ -329,6 +332,7 @@ class _Run:
         self, validation: Mapping[str, Sequence[PhotoBatch]], record: Mapping[str, Any]
     ) -> dict[str, dict[str, float]]:
         """Calibrate the best average, write it, and return what it reaches."""
+        say("calibrating the best weights")
         device = self.network.directions.device
         network = read_regressor(self.out / BEST, device)
         network.mean_light.copy_(self.mean.flat())

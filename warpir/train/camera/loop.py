@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from warpir.app.program import say
 from warpir.calibration.network import NUMBERS
 from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
 from warpir.train.networks.calibrator import (
@@ -122,6 +123,7 @@ class _Course:
 
     def validate(self, minutes: float) -> None:
         """Measure the average, write a line of the curve, and keep it if it is the best so far."""
+        say(f"step {self.steps}, {minutes:.1f} minutes: validating")  # on a CPU it takes minutes
         found = measure(self.average, self.validation)
         if found["score"] < self.best:
             self.kept, self.best = copy.deepcopy(self.average), found["score"]
