@@ -120,13 +120,24 @@ def test_the_cameras_training_heeds_its_rate(
         (["--minutes", "nan"], ExitCode.USAGE, "--minutes"),
         (["--total-minutes", "0"], ExitCode.USAGE, "--total-minutes"),
         (["--batch", "0"], ExitCode.USAGE, "--batch"),
+        (["--device", "gpu"], ExitCode.USAGE, "no device gpu here"),
         (["--start", "no.safetensors"], ExitCode.MODEL, "no.safetensors"),
         (["--resume", "--out", "empty"], ExitCode.INPUT, "nothing to resume"),
         (["--out", "begun"], ExitCode.OUTPUT, "a training that was begun"),
         (["--out", "done"], ExitCode.OUTPUT, "a camera's training"),
         (["--out", "file"], ExitCode.OUTPUT, "not a folder"),
     ],
-    ids=["nan", "no-time", "no-batch", "no-start", "no-state", "begun", "done", "file"],
+    ids=[
+        "nan",
+        "no-time",
+        "no-batch",
+        "no-device",
+        "no-start",
+        "no-state",
+        "begun",
+        "done",
+        "file",
+    ],
 )
 @pytest.mark.parametrize("network", ["camera", "regressor"])
 def test_training_looks_before_it_begins(

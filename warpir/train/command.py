@@ -136,9 +136,10 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
 
 
 def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dict[str, float]:
-    """Train the network that estimates cameras; photographs are cut without Warp."""
+    """Train the network that estimates cameras; Warp only knows the devices."""
     import torch
 
+    from warpir.render.device import choose_device
     from warpir.train.camera.crops import read_panoramas
     from warpir.train.camera.loop import begin_with_trunk, train_camera
     from warpir.train.lights import SKY_ONLY
@@ -147,7 +148,7 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     from warpir.train.places import of_fold
     from warpir.train.stepping import CameraSettings
 
-    device = torch.device(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = torch.device(choose_device(options.device))
     # What shows no ground shows no camera.
     usable = [p for p in panoramas if SKY_ONLY not in p.stem and p.stem not in options.without]
     names = [p.stem for p in usable]
