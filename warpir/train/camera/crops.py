@@ -72,16 +72,24 @@ class DrawnCameras:
     """How much farther from the principal point than it is shown the corner of a centred photo
     lies on the image plane (barrel), as a share; negative for pincushion; shape [B]."""
 
-    def plane(self, height: int, width: int) -> Tensor:
-        """Return right and up of pixels on the image plane at depth 1, shape [B, H, W, 2]."""
+    @property
+    def barrel(self) -> Tensor:
+        """Share by which a point lies farther out than shown, over its square distance, [B]."""
+        return self.bend / (0.25 * (1.0 + self.aspect**2) / self.focal**2)
+
+    def shown(self, height: int, width: int) -> Tensor:
+        """Return `plane` of a lens that does not bend."""
         across = (torch.arange(width, device=self.x.device) + 0.5) / width
         down = (torch.arange(height, device=self.x.device) + 0.5) / height
         right = (across - self.x[:, None]) * (self.aspect / self.focal)[:, None]
         up = (self.y[:, None] - down) / self.focal[:, None]
-        right, up = torch.broadcast_tensors(right[:, None, :], up[:, :, None])
-        corner = 0.25 * (1.0 + self.aspect**2) / self.focal**2
-        farther = 1.0 + (self.bend / corner)[:, None, None] * (right**2 + up**2)
-        return torch.stack([right * farther, up * farther], dim=-1)
+        return torch.stack(torch.broadcast_tensors(right[:, None, :], up[:, :, None]), dim=-1)
+
+    def plane(self, height: int, width: int) -> Tensor:
+        """Return right and up of pixels on the image plane at depth 1, shape [B, H, W, 2]."""
+        shown = self.shown(height, width)
+        squared = shown.square().sum(dim=-1, keepdim=True)
+        return shown * (1.0 + self.barrel[:, None, None, None] * squared)
 
     def world(self, plane: Tensor) -> Tensor:
         """Return unit directions in the camera-yaw frame, shape [B, H, W, 3].
@@ -101,13 +109,18 @@ class DrawnCameras:
         The unit direction in the picture (right, up) of what lies straight above the scene point
         that a token sees, and that point's elevation above the horizon [rad].
         """
-        plane = self.plane(HEIGHT // SHAPE[0], WIDTH // SHAPE[1])
+        size = HEIGHT // SHAPE[0], WIDTH // SHAPE[1]
+        plane, shown = self.plane(*size), self.shown(*size)
         elevation = torch.asin(self.world(plane)[..., 1].clamp(-1.0, 1.0))
         # World up in the camera's axes; a point of the plane at depth 1 that moves along it.
         up = torch.stack([self.roll.sin() * self.pitch.cos(), self.roll.cos() * self.pitch.cos()])
         forward = -self.pitch.sin()[:, None, None, None]
-        moved = F.normalize(up.T[:, None, None] + plane * forward, dim=-1)
-        return torch.cat([moved, elevation[..., None]], dim=-1).flatten(1, 2)
+        moved = up.T[:, None, None] + plane * forward
+        # Where the lens shows that: the inverse of how `plane` follows from `shown`.
+        along, squared = ((shown * v).sum(dim=-1, keepdim=True) for v in (moved, shown))
+        barrel = self.barrel[:, None, None, None]
+        moved = moved - shown * 2.0 * barrel * along / (1.0 + 3.0 * barrel * squared)
+        return torch.cat([F.normalize(moved, dim=-1), elevation[..., None]], dim=-1).flatten(1, 2)
 
     def numbers(self) -> Tensor:
         """Return the truth in the units and the order of `NUMBERS`, shape [B, 5]."""
