@@ -99,6 +99,28 @@ def test_flags_that_would_do_nothing_are_refused(
     assert capsys.readouterr().err.startswith(f"error: {named}: ")
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["camera"], "torchrun: its processes share"),
+        (["regressor", "--networks", "2"], "torchrun: its processes share"),
+        (["regressor"], "--device: no device cuda:99 here"),
+    ],
+)
+def test_processes_share_one_network_on_cards_that_are_there(
+    given: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, value in {"WORLD_SIZE": "100", "RANK": "99", "LOCAL_RANK": "99"}.items():
+        monkeypatch.setenv(name, value)
+    argv = [*given, "--panoramas", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(argv) == ExitCode.USAGE
+    assert capsys.readouterr().err.startswith(f"error: {words}")
+
+
 @pytest.mark.parametrize(("given", "rate"), [([], 1.2e-3), (["--rate", "1e-4"], 1e-4)])
 def test_the_cameras_training_heeds_its_rate(
     given: list[str], rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

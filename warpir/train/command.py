@@ -7,8 +7,8 @@ r"""Train the networks that warpir ships: for the light, and for the camera.
 
 Scenes are rendered as they are needed and then forgotten. A command stops after ``--minutes``, and
 ``--resume`` goes on, with the same panoramas, until ``--total-minutes`` are used up. With torchrun
-a network is trained on several cards. ``--without`` names panoramas that must not be learned from;
-of those that ``--validation`` names only the errors are looked at.
+one regressor's network is trained on several cards. ``--without`` names panoramas that must not be
+learned from; of those that ``--validation`` names only the errors are looked at.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -110,7 +111,7 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
     from warpir.train.worker import Worker
 
     worker = Worker.this()
-    device = f"cuda:{worker.local_rank}" if worker.count > 1 else choose_device(options.device)
+    device = choose_device(f"cuda:{worker.local_rank}" if worker.count > 1 else options.device)
     names = [p.stem for p in panoramas if p.stem not in options.without]
     began_with = _began_with(options)
     known = learned_from(began_with)
@@ -232,6 +233,9 @@ def _refuse_idle(options: argparse.Namespace, parser: argparse.ArgumentParser) -
         raise usage("--regressor", "the weights of --start have first layers of their own")
     if options.networks > 1 and options.fold is not None:
         raise usage("--fold", "each of --networks has its own")
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and (is_camera or options.networks > 1):
+        what = "its processes share the training of one regressor's network, and no other"
+        raise usage("torchrun", what, "leave it out")
 
 
 def _check(options: argparse.Namespace) -> None:
