@@ -468,6 +468,19 @@ def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -
         usable_rows(bench, ["truth", "other-light"], True, notices)
 
 
+def test_a_panorama_that_all_networks_have_learned_from_is_named(
+    data: Path, scenes: Scenes, tmp_path: Path
+) -> None:
+    """Also where the file that was learned from had another size."""
+    path = tmp_path / "regressor.safetensors"
+    save_regressor(random_regressor(3), path, {"panoramas": ["east_2k"]})
+    bench = Bench(scenes, "cpu", 0, InsertConfig(regressor=str(path)))
+    notices: list[str] = []
+    assert usable_rows(bench, ["truth"], True, notices) and not notices
+    assert usable_rows(bench, ["truth", "regression"], True, notices)
+    assert len(notices) == 1 and "learned from east:" in notices[0]
+
+
 def test_other_scenes_are_seen_by_this_camera(data: Path, scenes: Scenes) -> None:
     """Another place's light keeps its place in the picture: both agree in the camera-yaw frame."""
     bench = make_bench(data, scenes)

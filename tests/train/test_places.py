@@ -134,12 +134,16 @@ def test_a_panorama_is_judged_by_the_networks_that_have_not_learned_from_it(
     for k in range(3):
         paths.append(tmp_path / f"{k}.safetensors")
         two = ["two"] if k < 2 else []
-        record = {"panoramas": ["all", f"p{k}", *two], "started_from": {"panoramas": ["old"]}}
+        names = ["all", f"p{k}", *two, "grass_1k"]
+        record = {"panoramas": names, "started_from": {"panoramas": ["old"]}}
         save_regressor(random_regressor(k, SMALL), paths[-1], record)
     join_members(paths, tmp_path / "joined.safetensors")
     joined = replace(load_regressor(tmp_path / "joined.safetensors"), temperature=0.5)
     assert unseen_by(joined, "new") is joined
     assert unseen_by(joined, "old") is None and unseen_by(joined, "all") is None
+    # The same places in other sizes, as Poly Haven names its files
+    assert unseen_by(joined, "all_2k") is None and unseen_by(joined, "grass_16k") is None
+    assert unseen_by(joined, "grass_1") is joined
     part = unseen_by(joined, "p1")
     assert part is not None and part.members == (0, 2)
     assert part.temperature == 0.5  # that of the mean

@@ -21,7 +21,7 @@ from warpir.core.color import luminance
 from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
 from warpir.evaluate.scenes import CAMERA_HEIGHT, Place, Subject, mirrored, turned_to
-from warpir.evaluate.stage import Bench, Prediction, Stage
+from warpir.evaluate.stage import Bench, Prediction, Stage, unseen_by
 from warpir.io.images.photos import Photo, read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
@@ -447,6 +447,8 @@ def chosen_rows(text: str | None, has_predictions: bool, is_guided: bool = True)
 def usable_rows(bench: Bench, rows: Sequence[str], is_asked: bool, notices: list[str]) -> list[str]:
     """Return the usable rows; an unusable one is an error only if it was named.
 
+    A notice names the panoramas that no network of the regressor can be judged by.
+
     Raises:
         InputError: A row that was asked for needs what is not there.
     """
@@ -460,4 +462,13 @@ def usable_rows(bench: Bench, rows: Sequence[str], is_asked: bool, notices: list
             notices.append(f"row {name} is left out: {error.where}: {error.what}")
         else:
             usable.append(name)
+    if any("regressor" in ROWS[name].needs for name in usable):
+        panoramas = sorted({place.panorama for place, _ in bench.scenes})
+        known = [name for name in panoramas if unseen_by(bench.network, name) is None]
+        if known:
+            names = ", ".join(known)
+            notices.append(
+                f"all of the regressor's networks have learned from {names}: errors elsewhere are "
+                "larger"
+            )
     return usable

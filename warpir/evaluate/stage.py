@@ -36,7 +36,7 @@ from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves, ToneKnots
 from warpir.train.networks.regressor import random_regressor
-from warpir.train.places import learned_from
+from warpir.train.places import learned_from, without_size
 
 FLOOR_EVALUATIONS = 60
 """Largest number of evaluations in the fit of the tone floor's curves."""
@@ -315,9 +315,12 @@ class Bench:
 
 
 def unseen_by(network: Regressor, panorama: str) -> Regressor | None:
-    """Return the mean of the networks that have not learned from a panorama; None without any."""
-    records = network.record.get("members", [network.record])
-    kept = [k for k, record in enumerate(records) if panorama not in learned_from(record)]
+    """Return the mean of the networks that have not learned from a panorama; None without any.
+
+    A panorama is known by its name `without_size`.
+    """
+    records, name = network.record.get("members", [network.record]), without_size(panorama)
+    kept = [k for k, record in enumerate(records) if name not in learned_from(record)]
     if len(kept) == len(records):
         return network
     if not kept:

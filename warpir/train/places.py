@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -18,6 +19,11 @@ def place_of(name: str) -> str:
     """
     word = name.lower().partition("_")[0]
     return next((group[0] for group in SAME_SKY if word in group), word)
+
+
+def without_size(name: str) -> str:
+    """Return a panorama's name without the size that Poly Haven's files end in, such as ``_4k``."""
+    return re.sub(r"_\d+k$", "", name)
 
 
 def _shuffled(names: Collection[str], known: Collection[str]) -> list[str]:
@@ -60,6 +66,8 @@ def some_places(names: Sequence[str], count: int | None, known: Collection[str])
 def learned_from(record: Mapping[str, Any]) -> set[str]:
     """Return the panoramas that a network, and those it started from, have learned from.
 
+    Names are `without_size`: the same place in another size is no new one.
+
     Args:
         record: Of the network's weights, as `warpir.lighting.regressor.Regressor.record`.
     """
@@ -67,7 +75,7 @@ def learned_from(record: Mapping[str, Any]) -> set[str]:
     records = [record]
     while records:
         each = records.pop()
-        names |= set(each.get("panoramas", ()))
+        names |= {without_size(name) for name in each.get("panoramas", ())}
         records += each.get("members", [])
         records += [each["started_from"]] if each.get("started_from") else []
     return names

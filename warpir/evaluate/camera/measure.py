@@ -23,7 +23,7 @@ from warpir.core.errors import InputError
 from warpir.scene.camera import CameraEstimate
 from warpir.train.camera.crops import ASPECTS, DrawnCameras, Panoramas, cut, read_panoramas
 from warpir.train.photo_look import draw_faults, draw_looks
-from warpir.train.places import learned_from
+from warpir.train.places import learned_from, without_size
 from warpir.train.sampler import Sampler
 
 CONSTANT_FOV = 60.0
@@ -104,7 +104,7 @@ def unlearned(panoramas: Sequence[Path], network: Calibrator) -> tuple[list[Path
     Where it has learned from all of them, all are returned.
     """
     learned = learned_from(network.record)
-    fresh = [path for path in panoramas if path.stem not in learned]
+    fresh = [path for path in panoramas if without_size(path.stem) not in learned]
     known = len(panoramas) - len(fresh)
     if not fresh:
         words = "the network has learned from all of these panoramas: errors elsewhere are larger"
