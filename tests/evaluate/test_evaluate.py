@@ -1,6 +1,7 @@
 """The evaluation: scenes from a seed, rows that must be right or wrong, intervals, the command."""
 
 import json
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+import warpir
 from tests.builders.image_files import write_envmap
 from tests.builders.shapes import a_camera
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
@@ -17,6 +19,7 @@ from warpir.core.arrays import FloatArray
 from warpir.core.color import expose
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
+from warpir.evaluate import results
 from warpir.evaluate.command import main
 from warpir.evaluate.judge import light_figures
 from warpir.evaluate.light_errors import light_errors
@@ -466,6 +469,23 @@ def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -
     assert "other-light" in notices[0]
     with pytest.raises(InputError, match="two panoramas"):
         usable_rows(bench, ["truth", "other-light"], True, notices)
+
+
+def test_the_commit_is_this_checkouts_or_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine without git, and a package that is installed inside of another repository."""
+    monkeypatch.setenv("PATH", "")
+    assert results._commit() == "unknown"
+    monkeypatch.undo()
+    installed = tmp_path / "venv" / "warpir"
+    installed.mkdir(parents=True)
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (("init", "-q"), (*who, "commit", "-q", "--allow-empty", "-m", "a")):
+        subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+    for module in (warpir, results):
+        monkeypatch.setattr(module, "__file__", str(installed / "results.py"))
+    assert results._commit() == "unknown"
 
 
 def test_a_panorama_that_all_networks_have_learned_from_is_named(

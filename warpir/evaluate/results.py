@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import time
 from collections.abc import Sequence
@@ -106,9 +107,12 @@ def plain_values(value: Any) -> Any:
 
 
 def _commit() -> str:
-    """Return the commit of this checkout, or "unknown" for an installed package."""
+    """Return the commit of this checkout; "unknown" for an installed package, or without git."""
+    root = Path(warpir.__file__).parents[1]
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return "unknown"  # git would name that of a repository around the installed package
     git = subprocess.run(
-        ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"],
+        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"],
         capture_output=True,
         text=True,
         check=False,
