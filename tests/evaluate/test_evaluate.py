@@ -430,6 +430,19 @@ def test_main_scores_maps_that_another_system_made(data: Path, tmp_path: Path) -
     assert summary["uniform"]["all"]["image.full.rmse"]["mean"] > 0.01
 
 
+def test_scenes_without_a_map_are_left_out(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.save(tmp_path / f"{make_places(data).make(1)[0][0].name}.npy", np.ones((8, 16, 3)))
+    chosen = arguments(data, "--scenes", "2", "--rows", "uniform", "--samples", "1")
+    numbers = tmp_path / "numbers.json"
+    assert main([*chosen, "--predictions", str(tmp_path), "--json", str(numbers)]) == 0
+    assert "notice: 1 scenes have no map" in capsys.readouterr().out
+    summary = json.loads(numbers.read_text())["summary"]
+    counts = {row: groups["all"]["image.box.rmse"]["count"] for row, groups in summary.items()}
+    assert counts == {"uniform": 2, "predictions": 1}
+
+
 def test_main_says_in_a_line_what_is_wrong(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -232,8 +232,9 @@ def evaluate(
         judged, shown = judge.place(place, subjects)
         entries += judged
         panels += shown
-        error = np.mean([e.figures["image.box.rmse"] for e in judged if e.row == sheet_row])
-        say(f"{place.name}: {sheet_row}, RMSE of the box {float(error):.4f}")
+        found = [e.figures["image.box.rmse"] for e in judged if e.row == sheet_row]
+        words = f"RMSE of the box {float(np.mean(found)):.4f}" if found else "no map"
+        say(f"{place.name}: {sheet_row}, {words}")
     record = run_record(options, bench, scenes, notices)
     if options.procedural:
         network = read_regressor(options.regressor, device)
@@ -319,7 +320,8 @@ def _exchange(
         return {}
     predictions = read_predictions(options.predictions, places)
     if predictions.missing:
-        notices.append(f"{len(predictions.missing)} scenes have no map in {options.predictions}")
+        left_out = f"{len(predictions.missing)} scenes have no map in {options.predictions}"
+        notices.append(f"{left_out}: the row predictions is without them")
     notices += [f"{options.predictions}: {name} is of no scene" for name in predictions.unused]
     return predictions.maps
 

@@ -57,12 +57,15 @@ class Judge:
         """Return the errors of every row in one place, and its panels of the contact sheet."""
         quality = Quality(self.samples, 2, 5, self.bench.seed, 8.0)
         entries, panels = [], []
+        rows = list(self.rows)
+        if "predictions" in rows and place.name not in self.bench.predictions:
+            rows.remove("predictions")
         of_place: dict[str, tuple[Prediction, FloatArray, dict[str, float]]] = {}
         for subject in subjects:
             stage = Stage(subject, self.bench.device, quality, self.threads)
             regions = make_regions(stage.mask, stage.ratio)
             lights: dict[str, FloatArray] = {}
-            for name in self.rows:
+            for name in rows:
                 row = ROWS[name]
                 if row.of_subject is not None:
                     judged = _judge_light(place, row.of_subject(self.bench, stage, subject))
