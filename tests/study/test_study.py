@@ -625,6 +625,14 @@ def test_bad_manifests_are_refused(name: str, scenes: Path, tmp_path: Path) -> N
     refuse(["make", "scenes/m.json", "--out", "study"], 3, *words, cwd=tmp_path)
 
 
+def test_help_is_of_the_study(capsys: pytest.CaptureFixture[str]) -> None:
+    """Also of flags that an insertion has too."""
+    assert main(["make", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--seed N of sides and order (default: a new random one)" in text
+    assert "--out STUDY new folder" in text and "--alpha" in text and "--max-pixels N" in text
+
+
 def test_make_refuses_flags(scenes: Path, tmp_path: Path) -> None:
     (scenes / "m.json").write_text(json.dumps(manifest_of()))
     for argv, words in (

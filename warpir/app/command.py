@@ -158,10 +158,10 @@ class Parser(argparse.ArgumentParser):
         raise usage("command line", message)
 
     def format_help(self) -> str:
-        """Return the help; that of values is read from the sources of their fields."""
+        """Return the help; that of values without one is read from the sources of their fields."""
         about = field_docs()
         for action in self._actions:
-            if action.dest in OPTIONS:
+            if action.dest in OPTIONS and action.help is None:
                 is_shown = self.shows_all or not OPTIONS[action.dest].rule.expert
                 text = _help_of(action.dest, about[action.dest], self.shows_all)
                 action.help = text.replace("%", "%%") if is_shown else argparse.SUPPRESS
