@@ -95,6 +95,7 @@ def test_command_help_is_short_and_holds_what_documents_show(
     text = capsys.readouterr().out
     lines = text.splitlines()
     assert len(lines) <= 115 and max(map(len, lines)) <= 100
+    assert text.count("(") == text.count(")")
     root = Path(__file__).parents[2]
     documents = "".join(
         (root / name).read_text("utf-8") for name in ("README.md", "docs/manual.md")

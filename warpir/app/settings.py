@@ -200,8 +200,8 @@ class RenderConfig:
     """How the picture is rendered, and on what."""
 
     samples: int | None = option(None, "N", low=1, high=2**20)
-    """Mean samples per pixel, more where noise is (default: 40; above 3 megapixels the fewer, the
-    more pixels share what is seen, down to 16)"""
+    """Mean samples per pixel, more where noise is (default: 40); above 3 megapixels the fewer, the
+    more pixels share what is seen, down to 16"""
     rays: int = option(1, "N", low=1, high=2**10)
     """Rays per sample, of light and of surface each"""
     depth: int = option(5, "D", low=1, high=2**10)
