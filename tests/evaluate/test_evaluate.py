@@ -454,6 +454,9 @@ def test_main_says_in_a_line_what_is_wrong(
         (arguments(data, "--curve", "log"), ExitCode.USAGE, "log"),
         (arguments(data, "--scenes", "0"), ExitCode.USAGE, "--scenes"),
         (arguments(data, "--width", "9"), ExitCode.USAGE, "--width"),
+        (arguments(data, "--seed", "x"), ExitCode.USAGE, "--seed: expected a whole number"),
+        (arguments(data, "--camera"), ExitCode.USAGE, "--assets: has no use with --camera"),
+        (arguments(data, "--json", str(tmp_path)), ExitCode.OUTPUT, "a folder"),
         (arguments(data / "absent"), ExitCode.INPUT, "absent"),
         (["--panoramas", str(data / "assets"), "--assets", str(data)], ExitCode.INPUT, "nothing"),
         (

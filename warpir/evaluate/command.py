@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpir.app.command import Parser
 from warpir.app.config import InsertConfig, usage
 from warpir.app.program import run_program, say
 from warpir.core.atomic import write_file
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 SHEET_ROWS = ("lds-regression", "lds-uniform", "regression", "predictions", "brightest-region")
 """Rows for the contact sheet; the first of these that was asked for is shown."""
 SAVED = ("tables.md", "contact_sheet.png")
+OF_CAMERA = ("camera", "panoramas", "scenes", "seed", "width", "calibrator", "json", "debug")
+"""Flags that go with ``--camera``."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,9 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m warpir.evaluate", description=__doc__.partition("\n")[0]
-    )
+    parser = Parser(prog="python -m warpir.evaluate", description=__doc__.partition("\n")[0])
     _add_scene_flags(parser)
     add = parser.add_argument
     add("--out", type=Path, metavar="DIR", help="folder for " + " and ".join(SAVED))
@@ -102,15 +103,19 @@ def _add_model_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _count(text: str) -> int:
-    number = int(text)
-    if not 0 <= number < 2**32:
-        raise ValueError
-    return number
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**32):
+        expected = f"expected a whole number from 0 to {2**32 - 1}"
+        raise argparse.ArgumentTypeError(f"{expected} (found {text[:40]})")
+    return int(text)
 
 
 def _run(arguments: list[str]) -> int:
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
     if options.camera:
+        for name, value in vars(options).items():
+            if name not in OF_CAMERA and value != parser.get_default(name):
+                raise usage(f"--{name.replace('_', '-')}", "has no use with --camera", "omit it")
         _check(options, ("panoramas",))
         _evaluate_cameras(options)
         return ExitCode.DONE
@@ -158,8 +163,11 @@ def _check(options: argparse.Namespace, needed: Sequence[str]) -> None:
         raise usage("--samples", "at least 1")
     if options.curve not in RESPONSES:
         raise usage("--curve", f"no response {options.curve!a}", f"known: {', '.join(RESPONSES)}")
-    if options.json is not None and not options.json.absolute().parent.is_dir():
-        raise InputError(options.json, "its folder does not exist", code=ExitCode.RESOURCES)
+    if options.json is not None:
+        if not options.json.absolute().parent.is_dir():
+            raise InputError(options.json, "its folder does not exist", code=ExitCode.RESOURCES)
+        if options.json.is_dir():
+            raise InputError(options.json, "a folder", "name a file for --json", ExitCode.OUTPUT)
 
 
 def _evaluate_cameras(options: argparse.Namespace) -> None:
