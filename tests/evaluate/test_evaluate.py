@@ -14,7 +14,9 @@ import warpir
 from tests.builders.image_files import write_envmap
 from tests.builders.shapes import a_camera
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
+from warpir.app.run import Run
 from warpir.core.arrays import FloatArray
 from warpir.core.color import expose
 from warpir.core.errors import ExitCode, InputError
@@ -45,10 +47,13 @@ from warpir.evaluate.scenes import (
     mirrored,
 )
 from warpir.evaluate.stage import Bench, Prediction, Stage
+from warpir.lighting.regression import Regression, regress
+from warpir.lighting.regressor import load_regressor
 from warpir.render.picture.quality import Quality
 from warpir.scene.light import Light, Lobes, as_map, axis_from_angles, rasterize_lobes
 from warpir.scene.tone_curves import Curves
 from warpir.train.networks.regressor import random_regressor, save_regressor
+from warpir.train.regressor import join_members
 
 SUNS = {"east": (70.0, 35.0), "west": (-110.0, 50.0), "north": (10.0, 20.0)}
 """Azimuth and elevation of the made-up panoramas' suns [deg]."""
@@ -485,6 +490,32 @@ def test_a_row_that_cannot_be_made_is_left_out_unless_it_was_named(data: Path) -
     assert "other-light" in notices[0]
     with pytest.raises(InputError, match="two panoramas"):
         usable_rows(bench, ["truth", "other-light"], True, notices)
+
+
+def test_guided_rows_start_from_networks_that_have_not_learned_from_the_panorama(
+    data: Path, scenes: Scenes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = scenes[0][1][0]
+    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
+    for k, path in enumerate(paths):
+        record = {"panoramas": [subject.place.panorama]} if k else {}
+        save_regressor(random_regressor(k, SMALL), path, record)
+    join_members(paths, tmp_path / "both.safetensors")
+    config = InsertConfig(regressor=str(tmp_path / "both.safetensors"))
+    starts = []
+
+    def recover(run: Run, given: object, regression: Regression) -> None:
+        starts.append(regression.probability)
+        raise InterruptedError
+
+    monkeypatch.setattr("warpir.evaluate.rows.recover", recover)
+    row = ROWS["lds-regression"].of_subject
+    assert row is not None
+    with pytest.raises(InterruptedError):
+        row(Bench(scenes, "cpu", 0, config), sunlit(subject, 1), subject)
+    place = subject.place
+    alone = regress(load_regressor(paths[0]), place.photo, place.camera)
+    assert np.allclose(starts[0], alone.probability, atol=1e-4)
 
 
 def test_the_commit_is_this_checkouts_or_unknown(

@@ -231,7 +231,8 @@ def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
     """Return a row that runs warpir's guided recovery with some settings changed."""
 
     def predict(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-        return recover_light(bench, subject, subject.place.photo, changes)
+        place = subject.place
+        return recover_light(bench, subject, place.photo, place.panorama, changes)
 
     return predict
 
@@ -239,7 +240,8 @@ def guided(**changes: Any) -> Callable[[Bench, Stage, Subject], Prediction]:
 def guided_elsewhere(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     """Return the light that guidance recovers from another place's photograph."""
     other = bench.other(subject.place)
-    return recover_light(bench, subject, other.photo, {"start": "regressed"})
+    start = {"start": "regressed"}
+    return recover_light(bench, subject, other.photo, other.panorama, start)
 
 
 def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
@@ -251,7 +253,8 @@ def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
     reflected = replace(placement, asset_to_world=reflect @ placement.asset_to_world)
     flipped = replace(subject, placement=reflected)
     photo = np.ascontiguousarray(place.photo[:, ::-1])
-    prediction = recover_light(bench, flipped, photo, {"start": "regressed"})
+    start = {"start": "regressed"}
+    prediction = recover_light(bench, flipped, photo, place.panorama, start)
     light = mirrored(prediction.light, place.azimuth)
     shadow = light
     if prediction.light_shadow is not prediction.light:
@@ -260,12 +263,13 @@ def guided_mirrored(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
 
 
 def recover_light(
-    bench: Bench, subject: Subject, photo: FloatArray, changes: Mapping[str, Any]
+    bench: Bench, subject: Subject, photo: FloatArray, panorama: str, changes: Mapping[str, Any]
 ) -> Prediction:
     """Run what `warpir.insert` runs, up to the recovered light and curves.
 
-    The photo for guidance is display-encoded, shape [H, W, 3]; ``changes`` are settings that differ
-    from the bench's.
+    The photo for guidance is display-encoded, shape [H, W, 3], and cut out of ``panorama``, from
+    which the networks that start it have not learned; ``changes`` are settings that differ from the
+    bench's.
     """
     place = subject.place
     with tempfile.TemporaryDirectory() as folder:
@@ -285,12 +289,14 @@ def recover_light(
         )
         inputs = Inputs(read_photo(path), subject.asset, place.camera, subject.placement)
         started = time.perf_counter()
+        light, seen = make_light(inputs, config.light, config.tone_operator), None
+        if light is None:
+            seen = regress(bench.network_for(panorama), inputs.photo.srgb, inputs.camera)
         with OutputFolder(out) as output:
-            run = Run(config, inputs, output, device=bench.device)
-            outcome = recover(run, make_light(inputs, config.light, config.tone_operator))
-    light = outcome.light
+            outcome = recover(Run(config, inputs, output, device=bench.device), light, seen)
+    found = outcome.light
     about = {"seconds": round(time.perf_counter() - started, 2), "record": outcome.record}
-    return Prediction(light.light, light.light_shadow, light.curves, about=about)
+    return Prediction(found.light, found.light_shadow, found.curves, about=about)
 
 
 def _words(stem: str) -> str:

@@ -20,6 +20,7 @@ from warpir.io.lamps_file import LAMPS, lamps_to_json
 from warpir.io.lobes_file import lobes_to_json
 from warpir.lighting.estimate import Estimate, estimate_light
 from warpir.lighting.fit import fit_lobes
+from warpir.lighting.regression import Regression
 from warpir.lighting.regularizers import TrustRegion
 from warpir.lighting.scene_light import SceneLight, start_level
 from warpir.lighting.sg_light import narrowest
@@ -55,12 +56,13 @@ class Start:
     """The regressor's estimate, if it is the start."""
 
 
-def recover(run: Run, given: SceneLight | None) -> Outcome:
+def recover(run: Run, given: SceneLight | None, regression: Regression | None = None) -> Outcome:
     """Recover light and tone curves.
 
     Args:
         run: Configuration, inputs, output folder.
         given: Given or default light; None to estimate it from the photo.
+        regression: What the regressor sees in the photo, where it is known.
 
     Returns:
         Light, curves and lamps; those of the start where the acceptance test fails.
@@ -70,7 +72,7 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
             non-finite (6), or what ``--resume`` finds is another run's.
     """
     settings = run.config.optimize
-    start = Start(given) if given is not None else _estimated(run)
+    start = Start(given) if given is not None else _estimated(run, regression)
     with as_input_errors():
         checkpoints = open_checkpoints(run)
         with run.timings.stage("scene"):
@@ -115,10 +117,11 @@ def recover(run: Run, given: SceneLight | None) -> Outcome:
     return Outcome(light, inputs, measured, notices)
 
 
-def _estimated(run: Run) -> Start:
+def _estimated(run: Run, regression: Regression | None) -> Start:
     """Return the regressor's estimate from the photo; log its assumptions."""
+    light, tone = run.config.light, run.config.tone_operator
     with run.timings.stage("regress"):
-        estimate = estimate_light(run.inputs, run.config.light, run.config.tone_operator)
+        estimate = estimate_light(run.inputs, light, tone, regression)
     run.log.assume(*estimate.light.assumed)
     return Start(estimate.light, estimate)
 
