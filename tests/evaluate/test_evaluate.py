@@ -435,14 +435,19 @@ def test_main_scores_maps_that_another_system_made(data: Path, tmp_path: Path) -
     assert summary["uniform"]["all"]["image.full.rmse"]["mean"] > 0.01
 
 
-def test_scenes_without_a_map_are_left_out(
+def test_scenes_without_a_map_or_a_kind_are_left_out(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    np.save(tmp_path / f"{make_places(data).make(1)[0][0].name}.npy", np.ones((8, 16, 3)))
+    (place, _), (other, _) = make_places(data).make(2)
+    np.save(tmp_path / f"{place.name}.npy", np.ones((8, 16, 3)))
+    numbers, kinds = tmp_path / "numbers.json", tmp_path / "kinds.json"
+    kinds.write_text(json.dumps({f"{place.panorama}_4k": "sunny"}))
     chosen = arguments(data, "--scenes", "2", "--rows", "uniform", "--samples", "1")
-    numbers = tmp_path / "numbers.json"
-    assert main([*chosen, "--predictions", str(tmp_path), "--json", str(numbers)]) == 0
-    assert "notice: 1 scenes have no map" in capsys.readouterr().out
+    chosen += ["--predictions", str(tmp_path), "--kinds", str(kinds), "--json", str(numbers)]
+    assert main(chosen) == 0
+    printed = capsys.readouterr().out
+    assert "notice: 1 scenes have no map" in printed and "| sunny | 1 (1) | uniform |" in printed
+    assert f"notice: no kind of {other.panorama} in" in printed
     summary = json.loads(numbers.read_text())["summary"]
     counts = {row: groups["all"]["image.box.rmse"]["count"] for row, groups in summary.items()}
     assert counts == {"uniform": 2, "predictions": 1}

@@ -224,6 +224,7 @@ def evaluate(
     lpips = _load_lpips(options)
     notices = _missing_measures(lpips)
     scenes = _make_scenes(options, notices)
+    kinds = _kinds(options.kinds, {place.panorama for place, _ in scenes}, notices)
     predictions = _exchange(options, [place for place, _ in scenes], notices)
     device = choose_device(options.device)
     say(f"device: {device} (the first run compiles the kernels)")
@@ -232,7 +233,6 @@ def evaluate(
     for notice in notices:
         say(f"notice: {notice}")
     sheet_row = next((r for r in SHEET_ROWS if r in rows), rows[0])
-    kinds = _kinds(options.kinds)
     judge = Judge(bench, rows, options.samples, options.threads, lpips, sheet_row, kinds)
     entries: list[Entry] = []
     panels: list[Panel] = []
@@ -278,8 +278,8 @@ def _make_scenes(
     return scenes
 
 
-def _kinds(path: Path | None) -> dict[str, str]:
-    """Read the kinds of places by the panoramas' names.
+def _kinds(path: Path | None, panoramas: set[str], notices: list[str]) -> dict[str, str]:
+    """Read the kinds of places by the panoramas' names, `without_size` in the file or not.
 
     Raises:
         InputError: The file cannot be read, or holds something else.
@@ -287,11 +287,15 @@ def _kinds(path: Path | None) -> dict[str, str]:
     if path is None:
         return {}
     from warpir.core.strict_json import read_json_object
+    from warpir.train.places import without_size
 
-    kinds = read_json_object(path)
+    kinds = {without_size(name): kind for name, kind in read_json_object(path).items()}
     if not all(isinstance(kind, str) for kind in kinds.values()):
         raise InputError(path, "expected one word for each panorama's name")
-    return kinds
+    unknown = sorted(name for name in panoramas if without_size(name) not in kinds)
+    if unknown:
+        notices.append(f"no kind of {', '.join(unknown)} in {path}: the table by kind is without")
+    return {name: kinds[without_size(name)] for name in panoramas.difference(unknown)}
 
 
 def _load_lpips(options: argparse.Namespace) -> "Distance | None":
