@@ -143,6 +143,17 @@ def test_files_that_cannot_be_used_are_left_out(data: Path, tmp_path: Path) -> N
         Places([tmp_path / "broken.exr"], [data / "assets" / "cube.ply"], 0, WIDTH).make(1)
 
 
+def test_objects_have_room_in_the_narrowest_photographs(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that look down most, with the foot as high as it may be."""
+    monkeypatch.setattr("warpir.evaluate.scenes.PITCH", (-15.0, -14.99))
+    monkeypatch.setattr("warpir.evaluate.scenes.FOOT_ROW", (0.35, 0.351))
+    files = [[data / "panoramas" / "east" / "east.exr"], [data / "assets" / "cube.ply"]]
+    for place, subjects in Places(*files, 0, WIDTH, fov=20.0).make(6):
+        assert sunlit(subjects[0], 1).mask.any(), place.name
+
+
 def test_objects_stand_in_view_at_the_stated_size(data: Path) -> None:
     for place, (diffuse, glossy) in make_places(data, seed=11).make(6):
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -464,6 +475,7 @@ def test_main_says_in_a_line_what_is_wrong(
         (arguments(data, "--curve", "log"), ExitCode.USAGE, "log"),
         (arguments(data, "--scenes", "0"), ExitCode.USAGE, "--scenes"),
         (arguments(data, "--width", "9"), ExitCode.USAGE, "--width"),
+        (arguments(data, "--fov", "12"), ExitCode.USAGE, "between 20 and 120 degrees"),
         (arguments(data, "--seed", "x"), ExitCode.USAGE, "--seed: expected a whole number"),
         (arguments(data, "--camera"), ExitCode.USAGE, "--assets: has no use with --camera"),
         (arguments(data, "--json", str(tmp_path)), ExitCode.OUTPUT, "a folder"),

@@ -157,8 +157,9 @@ def _check(options: argparse.Namespace, needed: Sequence[str]) -> None:
         raise usage("--scenes", "at least 1")
     if not 16 <= options.width <= 4096:
         raise usage("--width", f"between 16 and 4096 (found {options.width})")
-    if not 10.0 <= options.fov <= 120.0:
-        raise usage("--fov", f"between 10 and 120 degrees (found {options.fov:g})")
+    # In a narrower photograph that looks down there is no room above the object's foot.
+    if not 20.0 <= options.fov <= 120.0:
+        raise usage("--fov", f"between 20 and 120 degrees (found {options.fov:g})")
     if options.samples < 1:
         raise usage("--samples", "at least 1")
     if options.curve not in RESPONSES:
