@@ -163,7 +163,8 @@ def main() -> None:
         report({**record, "commit": where["commit"], "device": where["device"]}, args.json)
         records.append(record)
     if args.docs is not None:
-        command = f"python -m benchmarks.stability --device {args.device or 'cpu'} --docs FILE"
+        quick = " --quick" * args.quick
+        command = f"python -m benchmarks.stability --device {device}{quick} --docs FILE"
         args.docs.write_text(document(records, where, command), encoding="utf-8")
     outside = [f"{r['group']}: {r['case']}, {r['quantity']}" for r in records if not is_kept(r)]
     print(f"{len(records)} cases, {len(outside)} outside their bounds", *outside, sep="\n")

@@ -4,11 +4,16 @@ Each case is measured against float64, never against another run of ours; its bo
 constant beside it that says where it comes from.
 """
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks.stability import __main__ as stability
 from benchmarks.stability.__main__ import cases, is_kept, measure, number
 from benchmarks.stability.case import Case, Measured, max_relative, relative_l2
+from warpir.render.device import choose_device
 
 
 def marked(case: Case) -> object:
@@ -52,6 +57,16 @@ def test_a_case_can_fail(measured: Measured) -> None:
     assert not is_kept(record)
     good = Case("g", "n", "q", "m", lambda device: Measured(1.0, True, 1.0), 1.0, 1.0, "none")
     assert is_kept(measure(good, "cpu", False))
+
+
+def test_the_page_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = Case("light", "n", "q", "m", lambda device: Measured(0.5, True), 1.0, None, "none")
+    page = tmp_path / "page.md"
+    monkeypatch.setattr(stability, "cases", lambda: [good])
+    monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--docs", str(page)])
+    stability.main()
+    device = choose_device(None)
+    assert f"python -m benchmarks.stability --device {device} --quick --docs" in page.read_text()
 
 
 def test_errors_see_what_is_not_finite() -> None:
