@@ -67,13 +67,6 @@ def frames(
     return argv, folder / "out"
 
 
-def copy_of(done: Path, out: Path) -> None:
-    """Copy a finished sequence, whose frames then say that they were made there."""
-    shutil.copytree(done, out)
-    for path in out.glob("*/run.json"):
-        path.write_text(path.read_text().replace(str(done), str(out)))
-
-
 def refuse_to_render(*args: object, **kwargs: object) -> NoReturn:
     raise AssertionError("a finished frame was rendered again")
 
@@ -141,6 +134,16 @@ def test_finished_frames_are_left_alone(
     assert "frames: 3, of which 3 are done already" in capsys.readouterr().out
 
 
+def test_moved_frames_are_left_alone(
+    frames: tuple[list[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A sequence whose folder was moved since, or is named otherwise, is done already."""
+    argv, out = frames
+    shutil.copytree(out, tmp_path / "moved")
+    assert main([*argv, "--out", str(tmp_path / "moved"), "--validate"]) == ExitCode.DONE
+    assert "frames: 3, of which 3 are done already" in capsys.readouterr().out
+
+
 def stop_at_the_second_picture(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Interrupt the second frame once; what is returned has an element for each that began."""
     make_picture, calls = warpir.report.result.make_picture, []
@@ -184,7 +187,7 @@ def test_other_results_are_not_replaced(
     """A frame made otherwise, or damaged, is reported by its line; --overwrite renders it again."""
     _, done = frames
     out = tmp_path / "out"
-    copy_of(done, out)
+    shutil.copytree(done, out)
     lines = write_lines(tmp_path / "s.jsonl", [*FRAMES[:2], {**FRAMES[2], "seed": 6}, {}], inputs)
     (out / "0002" / "layers.exr").write_bytes(b"cut")
     (out / "0004").mkdir()
@@ -214,7 +217,7 @@ def test_renewed_sequence_keeps_what_is_done(
 ) -> None:  # fmt: skip
     """Only frames that differ are rendered again, and each of them once, whenever it is stopped."""
     out = tmp_path / "out"
-    copy_of(frames[1], out)
+    shutil.copytree(frames[1], out)
     changed = [FRAMES[0], *({**frame, "seed": 9} for frame in FRAMES[1:])]
     config = parse(argv_of(inputs, first, write_lines(tmp_path / "s", changed, inputs), out)).config
     calls = stop_at_the_second_picture(monkeypatch)
@@ -242,7 +245,7 @@ def test_batch_looks_at_all_that_a_sequence_takes(
     one, two, whole = (check(tmp_path / "none", *FRAMES[:count]) for count in (1, 2, 3))
     assert 0 < one.found["memory"] <= two.found["memory"] <= whole.found["memory"]
     assert 0 < one.found["disk"] < two.found["disk"] < whole.found["disk"]
-    copy_of(frames[1], tmp_path / "out")
+    shutil.copytree(frames[1], tmp_path / "out")
     rest = check(tmp_path / "out", *FRAMES[:2], {**FRAMES[2], "seed": 9})
     assert rest.found["disk"] == whole.found["disk"] - two.found["disk"]
     (tmp_path / "out" / "sequence.html").write_text("<p>mine</p>")

@@ -65,8 +65,8 @@ def _same(config: InsertConfig, filled: InsertConfig, record: dict[str, Any]) ->
     made = {name: value for name, value in record["config"].items() if name in DEFAULTS}
     if len(made) < len(record["config"]):
         return False
-    # As many threads as there are make the same picture.
-    of_the_run = {name: config.flat()[name] for name in ("overwrite", "resume", "threads")}
+    # Elsewhere, or by as many threads as there are, it is the same picture.
+    of_the_run = {name: config.flat()[name] for name in ("out", "overwrite", "resume", "threads")}
     read = record.get("inputs")
     if config_of_record(made).changed(**of_the_run) != config or not isinstance(read, dict):
         return False
