@@ -387,8 +387,8 @@ def test_rows_and_flags_become_configurations(tmp_path: Path) -> None:
     rows = read(
         write_manifest(tmp_path, [
             {"name": "a", "photo": "sub/p.png", "asset": "/abs/car.glb", "at": [3, 4]},
-            {"name": "b", "photo": "p.png", "camera-height": 2, "light": None, "sun": "10,20",
-             "model": "someone/some-model", "prompt": "a car", "guidance": "none"},
+            {"name": "b", "photo": "p.png", "demo": False, "camera-height": 2, "light": None,
+             "sun": "10,20", "model": "someone/some-model", "prompt": "a car", "guidance": "none"},
         ]),
         place=(0.0, 0.0, -5.0), asset="car.glb", light="noon.hdr",
     )  # fmt: skip

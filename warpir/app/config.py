@@ -296,7 +296,9 @@ def replaced_by(changes: Mapping[str, Any], among: Container[str]) -> dict[str, 
         other: DEFAULTS[other]
         for pair in EXCLUSIVE
         for name, other in (pair, pair[::-1])
-        if changes.get(name) is not None and other in among and other not in changes
+        if changes.get(name, DEFAULTS[name]) != DEFAULTS[name]
+        and other in among
+        and other not in changes
     }
 
 
