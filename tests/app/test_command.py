@@ -495,6 +495,13 @@ def test_config_file_yields_to_flags(tmp_path: Path) -> None:
     command = parse(["--config", str(path), "--samples", "8"])
     assert command.config.render.samples == 8
     assert len(command.notices) == 1 and "--samples" in command.notices[0]
+    # As in the lines of a batch or a sequence, a flag wins over what it excludes in the file, too.
+    command = parse(["--config", str(path), "--at", "3,4", "--light", "noon.hdr"])
+    assert command.config.placement.place is None and command.config.light.sky is None
+    assert [notice.split()[0] for notice in command.notices] == ["place", "sky"]
+    assert refused(["--config", str(path), "--at", "3,4", "--place", "0,0,1"]).where == "--at"
+    path.write_text(f"{YAML}camera: c.json\n".replace("camera-height", "exposure"))
+    assert refused(["--config", str(path), "--fov", "50"]).where == "--fov"
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,17 @@ from functools import partial
 from typing import Any, NoReturn, get_args
 
 import warpir
-from warpir.app.config import DEFAULTS, DOTTED, OPTIONS, PARTS, InsertConfig, Option, flag, usage
+from warpir.app.config import (
+    DEFAULTS,
+    DOTTED,
+    OPTIONS,
+    PARTS,
+    InsertConfig,
+    Option,
+    flag,
+    replaced_by,
+    usage,
+)
 from warpir.app.config_file import closest, kind_of, read_config_file
 from warpir.core.errors import InputError, raise_all, shown
 from warpir.core.limits import Limits
@@ -64,7 +74,7 @@ class Command:
     validate: bool = False
     """Stop after all inputs were read and checked."""
     notices: tuple[str, ...] = ()
-    """Where a flag replaced a value of the configuration file, one line each."""
+    """Where a flag replaced or excluded a value of the configuration file, one line each."""
 
 
 def flags_of(*names: str) -> dict[str, str]:
@@ -86,11 +96,17 @@ def parse(argv: Sequence[str]) -> Command:
     if path is not None:
         filed = read_config_file(path, _limits_for_config(texts))
         raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
-    config = InsertConfig(**read_values(filed | texts))
+    # Not a camera file, which says more than the one number that would take its place.
+    excluded = replaced_by(texts, filed.keys() - {"camera"})
+    config = InsertConfig(**read_values(filed | excluded | texts))
     notices = tuple(
         f"{flag(name)} given at the command line replaces the value in {path}"
         for name in texts
         if name in filed
+    ) + tuple(
+        f"{name} in {path} is left out: a flag given at the command line excludes it"
+        for name in excluded
+        if filed[name] != DEFAULTS[name]
     )
     config.require_inputs()
     return Command(config, validate, notices)
