@@ -732,6 +732,19 @@ def test_validate_reads_everything_without_torch_or_warp(scene: list[str], tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_flags_without_effect_are_said(
+    scene: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What only a model would read is named where none guides, and nothing else is."""
+    read = ["--preview-every", "3", "--guidance", "none", "--allow-download"]
+    assert warpir.insert.main([*scene, *read, "--validate"]) == ExitCode.DONE
+    assert "without effect" not in capsys.readouterr().out
+    unread = ["--steps", "0", "--loss", "csd", "--trust", "2", "--no-tone-curve"]
+    assert warpir.insert.main([*scene, *unread, "--validate"]) == ExitCode.DONE
+    (line,) = [s for s in capsys.readouterr().out.splitlines() if "without effect" in s]
+    assert {*line.partition("guides: ")[2].split(", ")} == {s for s in unread if s[:2] == "--"}
+
+
 @pytest.mark.parametrize("axis", [None, "+z", "-z"])
 def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) -> None:
     """Without --asset-up an OBJ is taken as Y up; with it the asset is turned; both are said."""

@@ -111,7 +111,9 @@ def test_light_rotate_and_exposure_change_the_runs_light(
         photo=str(inputs / "photo.png"), asset=str(inputs / "box.glb"), out=str(tmp_path / "o"),
         reuse=str(first.out), light_rotate=90.0, exposure=1.0,
     )  # fmt: skip
-    light = make_light(read_inputs(config), config.light, config.tone_operator)
+    read = read_inputs(config.changed(ground_albedo=0.4))
+    assert any("--ground-albedo: without effect" in notice for notice in read.notices)
+    light = make_light(read, config.light, config.tone_operator)
     expected = 2.0 * rotate_map(read_envmap(first.out / "envmap.exr"), 90.0)
     assert light.light is light.light_shadow and light.light.texels is not None
     np.testing.assert_allclose(light.light.texels, expected, rtol=1e-6)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.app.config import InsertConfig, refused_refinement, usage
+from warpir.app.config import OPTIONS, InsertConfig, flag, refused_refinement, usage
 from warpir.app.model_files import require_model
 from warpir.app.photo_world import (
     CameraEstimator,
@@ -322,10 +322,7 @@ def _notices(
     if config.camera.proxy and files.proxy:
         yield from _about(config.camera.proxy, files.proxy.notices)
     yield from files.log.notices
-    if not config.is_guided and config.guidance.prompt:
-        yield "--prompt: nothing reads it without --model"
-    if not config.is_guided and config.optimize.steps:
-        yield "--steps: there are none without --model"
+    yield from _without_effect(config)
     if config.camera.undistort and files.view.lens.is_straight:
         yield "--undistort: the camera has no distortion, nothing was undone"
     yield from camera.notices
@@ -348,6 +345,26 @@ def _notices(
         )
     if files.occluder is not None and config.is_guided:
         yield "guidance does not see --occluder-mask; the pictures it leads to do"
+
+
+READ_ANYWAY = ("guidance", "model", "preview_every", "guidance_width")
+"""Fields of a model's parts that say something without one: two are those of the preview."""
+
+
+def _without_effect(config: InsertConfig) -> Iterator[str]:
+    """Yield the flags that were given and that nothing reads in this run."""
+    values = config.flat()
+    of_a_model = [
+        flag(name)
+        for name, option in OPTIONS.items()
+        if option.part in ("guidance", "diffusion", "adapter", "optimize")
+        and not (option.rule.by_hand or name in READ_ANYWAY)
+        and values[name] != option.default
+    ]
+    if of_a_model and not config.is_guided:
+        yield f"without effect where no model guides: {', '.join(of_a_model)}"
+    if config.light.reuse is not None and config.light.ground_albedo is not None:
+        yield "--ground-albedo: without effect on the light of --reuse (--exposure)"
 
 
 PICTURES = ("photo", "occluder_mask", "shadow_mask", "light")
