@@ -319,6 +319,20 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
     assert len(inside) == 9
 
 
+@pytest.mark.parametrize(("place", "at", "moves"), [
+    (None, None, True), (None, "24,24", True), ("0,0,-5", None, False),
+])  # fmt: skip
+def test_object_that_follows_the_camera_is_said(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    place: str | None, at: str | None, moves: bool,
+) -> None:  # fmt: skip
+    """A place in the photo is another one of the world in each frame of a camera that moves."""
+    lines = write_lines(tmp_path / "s.jsonl", [{}, {"pitch": -16}], inputs)
+    argv = argv_of(inputs, first, lines, tmp_path / "out", place=place, at=at)
+    assert main([*argv, "--validate"]) == ExitCode.DONE
+    assert ("it moves with the camera" in capsys.readouterr().out) == moves
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

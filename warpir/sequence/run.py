@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import Loaders
+from warpir.app.inputs import Inputs, Loaders
 from warpir.app.program import attempt, say
 from warpir.calibration.photos import FirstPhoto
 from warpir.core.signals import Stopped
 from warpir.io.results import OutputFolder
-from warpir.sequence.frames import SUMMARY, read_sequence, write_summary
+from warpir.sequence.frames import SUMMARY, Frame, read_sequence, write_summary
 from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
 
 
@@ -22,8 +22,7 @@ def check_frames(config: InsertConfig) -> None:
     Raises:
         InputError: A line or a frame cannot be used, or the folder not written.
     """
-    frames = read_sequence(config, Loaders())
-    refuse_other_page(config)
+    frames = _read_frames(config, Loaders())
     OutputFolder(config.output.folder, overwrite=True).check()  # the frames' folders were looked at
     say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
@@ -42,8 +41,7 @@ def insert_frames(
         InputError: A line or a frame cannot be used, or the disk is full.
     """
     loaders = Loaders(FirstPhoto())
-    frames = read_sequence(config, loaders, renews=renews)
-    refuse_other_page(config)
+    frames = _read_frames(config, loaders, renews)
     done = 0
     try:
         for frame in frames:
@@ -65,3 +63,24 @@ def insert_frames(
     record = write_summary(config, frames, say)
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
     return config.output.folder, (*composites, *record["video"], SUMMARY), record
+
+
+def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -> tuple[Frame, ...]:
+    """Read all frames, as `read_sequence`, and say where an object would follow the camera.
+
+    Raises:
+        InputError: A line or a frame cannot be used, or there is another page.
+    """
+    poses: set[bytes] = set()
+
+    def look_at(frame: Frame, inputs: Inputs) -> None:
+        if frame.config.placement.place is None and "at" not in frame.changed:
+            poses.add(inputs.camera.c2w.tobytes())
+
+    frames = read_sequence(config, loaders, renews=renews, look_at=look_at)
+    if len(poses) > 1:
+        how = "at its pixel" if config.placement.at is not None else "where it is seen"
+        say(f"notice: the camera moves, and the object is set {how} in each frame anew: it moves "
+            "with the camera (--place keeps it where it stands)")  # fmt: skip
+    refuse_other_page(config)
+    return frames
