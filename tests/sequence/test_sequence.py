@@ -279,7 +279,7 @@ BAD_LINES: list[tuple[object, str]] = [
     ({"place": [0, 0, -5], "at": [3, 3]}, "--at: cannot be used with --place"),
     ({"photo": "none.png"}, "none.png: no such file"),
     ({"asset": "photo.png"}, "photo.png: not a mesh"),
-    ({"place": [0, 0, 5]}, "--place:"),
+    ({"at": [3000, 3]}, "--at: outside the photo"),
     ({"photo": None}, "--photo: needed"),
 ]
 
@@ -317,6 +317,21 @@ def test_line_replaces_what_excludes_it(inputs: Path, first: Run, tmp_path: Path
     assert configs[3].placement.scale is None
     inside = [pair for pair in EXCLUSIVE if set(pair) <= set(FRAME_FIELDS)]
     assert len(inside) == 9
+
+
+def test_object_may_leave_the_frame(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A frame that does not see the object is a frame; without any other the place is wrong."""
+    lines = write_lines(tmp_path / "s.jsonl", [{}, {"place": [0, 0, 50]}], inputs)
+    out = tmp_path / "out"
+    assert main(argv_of(inputs, first, lines, out)) == ExitCode.DONE
+    seen, unseen = (record_of(out / name)["measured"] for name in ("0001", "0002"))
+    assert seen["object_pixels"] > 0 and unseen["object_pixels"] == 0
+    assert "notice: the object is behind the camera" in capsys.readouterr().out
+    write_lines(lines, [{"place": [0, 0, 50]}], inputs)
+    argv = argv_of(inputs, first, lines, tmp_path / "other")
+    assert_fails(capsys, argv, ExitCode.INPUT, "no frame sees the object")
 
 
 @pytest.mark.parametrize(("place", "at", "moves"), [

@@ -90,10 +90,11 @@ class Loaders:
     Args:
         estimator: Estimates the camera of a photo; None: nothing is estimated, because the inputs
             are only checked.
+        must_be_seen: Whether an object outside the photo is refused: it may leave a film's frame.
     """
 
-    def __init__(self, estimator: CameraEstimator | None = None) -> None:
-        self.estimator = estimator
+    def __init__(self, estimator: CameraEstimator | None = None, must_be_seen: bool = True) -> None:
+        self.estimator, self.must_be_seen = estimator, must_be_seen
         self.photo: Callable[[InputConfig, Limits], Photo] = read_photo_of
         self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
@@ -129,7 +130,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     loaders = loaders or Loaders()
     files = _read_files(config, loaders)
     try:
-        return _joined(config, files)
+        return _joined(config, files, loaders.must_be_seen)
     except InputError as error:
         other = other_camera(files.view.camera)
         if other is None:
@@ -142,7 +143,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         return replace(inputs, notices=(f"{notice} ({error.what})", *inputs.notices))
 
 
-def _joined(config: InsertConfig, files: _Files) -> Inputs:
+def _joined(config: InsertConfig, files: _Files, must_be_seen: bool) -> Inputs:
     """Set the object into the photo's world.
 
     Raises:
@@ -151,7 +152,9 @@ def _joined(config: InsertConfig, files: _Files) -> Inputs:
     straight, undistorted_by = _straightened(files)
     world = make_world(config.camera, config.placement.place, files.view, files.points)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
-    placement = stand_on_ground(config.placement, files.asset, world, mesh, config.camera.plane)
+    placement = stand_on_ground(
+        config.placement, files.asset, world, mesh, config.camera.plane, must_be_seen
+    )
     shade = None
     if straight.shaded is not None:
         bounds = files.asset.bounds()

@@ -313,10 +313,12 @@ def stand_on_ground(
     world: PhotoWorld,
     mesh: ReceiverMesh | None = None,
     is_plane: bool = True,
+    must_be_seen: bool = True,
 ) -> Placement:
     """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
 
-    It stands where it was asked for, or where the points leave space.
+    It stands where it was asked for, or where the points leave space; a ``--place`` outside the
+    photo is refused where it must be seen.
 
     Raises:
         InputError: There is no such place, or no free one, or the object would be below the ground.
@@ -336,6 +338,7 @@ def stand_on_ground(
             size=asked.size if size is None else size,
             mesh=mesh,
             is_plane=is_plane,
+            must_be_seen=must_be_seen or world.place is None,
         )
 
     is_sized = asked.size is not None or asked.scale is not None

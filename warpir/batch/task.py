@@ -157,7 +157,8 @@ def _check_sequence(config: InsertConfig) -> dict[str, Any]:
             memory.append(_memory(frame.config, inputs))
             disk.append(needed_bytes(frame.config, inputs))
 
-    frames = read_sequence(config, Loaders(), renews=True, look_at=look_at)
+    loaders = Loaders(must_be_seen=False)
+    frames = read_sequence(config, loaders, renews=True, look_at=look_at)
     refuse_other_page(config)
     OutputFolder(config.output.folder, overwrite=True).check()
     return {

@@ -47,6 +47,8 @@ class Placement:
     """Doubtful values, one line each."""
     summary: str = ""
     """Distance, size and position in the photo of the object, one line."""
+    is_seen: bool = True
+    """Whether its box reaches into the photo."""
 
     def record(
         self, low: Float64Array, high: Float64Array, camera: Camera, sink: float
@@ -82,6 +84,7 @@ def place_asset(
     size: float | None = None,
     mesh: ReceiverMesh | None = None,
     is_plane: bool = True,
+    must_be_seen: bool = True,
 ) -> Placement:
     """Set an asset on the ground.
 
@@ -98,6 +101,7 @@ def place_asset(
         mesh: Receiver mesh that the object may stand on.
         is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
             the plane only defines the upright direction.
+        must_be_seen: Whether an object outside the photo is refused.
 
     Raises:
         InputError: The place is not on the visible ground, or the camera cannot see the object.
@@ -124,11 +128,18 @@ def place_asset(
     asset_to_world = _standing(low, high, scale, rotation, stand)
     shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
     where = "--at" if place is None else "--place"
-    seen, cut = _check_in_view(where, shown, box_corners(low, high), asset_to_world, camera)
+    corners = box_corners(low, high)
+    _refuse_within(where, shown, corners, asset_to_world, camera)
+    try:
+        is_seen, (seen, cut) = True, _in_view(where, corners, asset_to_world, camera)
+    except InputError as error:
+        if must_be_seen:
+            raise
+        is_seen, (seen, cut) = False, ("not in the photo", [error.what])
     warnings += cut
     away = float(np.linalg.norm(stand - origin))
     summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
-    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary)
+    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary, is_seen)
 
 
 def settled(
@@ -363,13 +374,10 @@ def box_corners(low: Float64Array, high: Float64Array) -> Float64Array:
     )
 
 
-def _check_in_view(
+def _refuse_within(
     where: str, size: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
-) -> tuple[str, list[str]]:
-    """Refuse an object that the camera cannot see; return where in the photo it is, and warnings.
-
-    The bounding box is tested, so an object that just fits may be reported as cut.
-    """
+) -> None:
+    """Refuse an object whose bounding box holds the camera."""
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
     if np.all((eye > corners[0]) & (eye < corners[-1])):
         # Files in millimetres are a thousand times as large as what they show.
@@ -382,6 +390,18 @@ def _check_in_view(
             f"the camera is inside the object of {size} m",
             f"move it away, or use --size or --scale ({unit})",
         )
+
+
+def _in_view(
+    where: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
+) -> tuple[str, list[str]]:
+    """Return where in the photo an object is, and warnings.
+
+    The bounding box is tested, so an object that just fits may be reported as cut.
+
+    Raises:
+        InputError: The camera cannot see it.
+    """
     pixels = camera.project(corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3])
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     if len(seen) == 0:

@@ -58,7 +58,8 @@ class Frame:
     """Of the file, from 1."""
     config: InsertConfig
     """Complete: it makes the same result without the sequence, but for a camera that is estimated:
-    the first frame's holds for all of its size."""
+    the first frame's holds for all of its size; and for an object outside the photo, which a single
+    photo refuses."""
     changed: tuple[str, ...]
     """The fields that the line names."""
     is_done: bool = False
@@ -96,7 +97,7 @@ def read_sequence(
     _refuse_other_summary(out / SUMMARY, config)
     if config.light.reuse is not None:  # once, not as a problem of every line
         loaders.run(config.light.reuse, config.limits)
-    frames, problems = [], []
+    frames, problems, is_seen = [], [], False
     lines, _ = read_json_lines(config.task.sequence, "frames", FRAME_COUNT_LIMIT, config.limits)
     for number, (line, raw) in enumerate(lines, start=1):
         try:
@@ -104,10 +105,14 @@ def read_sequence(
             inputs = read_inputs(frame.config, loaders)
             make_light(inputs, frame.config.light, frame.config.tone_operator)
             frames.append(_looked_up(frame, renews))
+            is_seen |= inputs.placement.is_seen
             look_at(frames[-1], inputs)
         except InputError as error:
             problems += [_at_line(config.task.sequence, line, e) for e in (error, *error.also)]
     raise_all(problems)
+    if not is_seen:
+        advice = "give another --place, or the cameras of its world"
+        raise InputError(config.task.sequence, "no frame sees the object", advice)
     return tuple(frames)
 
 

@@ -22,7 +22,7 @@ def check_frames(config: InsertConfig) -> None:
     Raises:
         InputError: A line or a frame cannot be used, or the folder not written.
     """
-    frames = _read_frames(config, Loaders())
+    frames = _read_frames(config, Loaders(must_be_seen=False))
     OutputFolder(config.output.folder, overwrite=True).check()  # the frames' folders were looked at
     say(f"frames: {len(frames)}, of which {sum(f.is_done for f in frames)} are done already")
 
@@ -40,7 +40,7 @@ def insert_frames(
     Raises:
         InputError: A line or a frame cannot be used, or the disk is full.
     """
-    loaders = Loaders(FirstPhoto())
+    loaders = Loaders(FirstPhoto(), must_be_seen=False)
     frames = _read_frames(config, loaders, renews)
     done = 0
     try:
