@@ -422,6 +422,7 @@ mark: false
 width: null
 lora-layers: [to_q, to_out.0]
 graphs: false
+grain: off             # which YAML reads as false
 """
 
 
@@ -430,7 +431,7 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
     expected = parse(
         ["--photo", "p.png", "--asset", "a.glb", "--out", "o", "--camera-height", "1.5",
          "--rotate-y", "30", "--place", "-1,0,-3.5", "--sky", "0.1,0.2,0.3", "--samples", "16",
-         "--no-mark", "--lora-layers", "to_q,to_out.0", "--no-graphs"]
+         "--no-mark", "--lora-layers", "to_q,to_out.0", "--no-graphs", "--grain", "off"]
     ).config  # fmt: skip
     path = tmp_path / "run.yaml"
     path.write_text(YAML)

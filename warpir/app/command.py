@@ -137,6 +137,8 @@ def read_values(given: Mapping[str, Any], where: Callable[[str], str] = flag) ->
     values, problems = {}, []
     for name, value in given.items():
         option = OPTIONS[name]
+        if value is False and "off" in option.rule.choices:
+            value = "off"  # which YAML 1.1 reads as false
         try:
             values[name] = convert(value, option.kind, option.rule.separator)
         except ValueError:
