@@ -253,6 +253,17 @@ def test_batch_looks_at_all_that_a_sequence_takes(
     assert answer.status == ExitCode.OUTPUT and "not a page of warpir's" in answer.lines[0]
 
 
+def test_a_video_that_could_be_made_now_is_missing(
+    frames: tuple[list[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch has done a sequence without its video only where there is no ffmpeg."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    task = Task(CHECK, parse(frames[0]).config.flat())
+    assert do_task(task).found["is_done"]
+    (tmp_path / "ffmpeg").touch(0o755)
+    assert not do_task(task).found["is_done"]
+
+
 def test_changed_inputs_are_noticed(
     inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,7 +35,7 @@ from warpir.core.strict_json import (
     read_json_object,
 )
 from warpir.lighting.scene_light import make_light
-from warpir.sequence.video import VIDEO, NoVideo, write_video
+from warpir.sequence.video import VIDEO, NoVideo, find_ffmpeg, write_video
 
 FORMAT = "warpir-sequence"
 VERSION = 1
@@ -187,6 +187,8 @@ def write_summary(
 def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
     """Return whether all frames are done and the summary is of them and of the video beside it.
 
+    Where there is no video, ffmpeg is not there either.
+
     Args:
         config: Of the sequence.
         frames: All of them, from `read_sequence`.
@@ -200,7 +202,9 @@ def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
     if found.get("frames") != json.loads(json.dumps(_records(frames))):
         return False
     before, digest = _made_before(config), _video_digest(config)
-    return not before or before == _video_record(config, frames, digest)
+    if not before:
+        return find_ffmpeg() is None
+    return before == _video_record(config, frames, digest)
 
 
 def _make_video(
