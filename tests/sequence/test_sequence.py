@@ -345,6 +345,17 @@ def test_object_may_leave_the_frame(
     assert_fails(capsys, argv, ExitCode.INPUT, "no frame sees the object")
 
 
+def test_what_needs_a_camera_finds_it_on_the_line(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--up for all frames, whose cameras the lines name; a line that names none is told."""
+    camera = str(first.out / "camera.json")
+    lines = write_lines(tmp_path / "s.jsonl", [{"camera": camera}, {}], inputs)
+    argv = argv_of(inputs, first, lines, tmp_path / "out", up="y")
+    (problem, *_) = assert_fails(capsys, argv, ExitCode.USAGE, "s.jsonl:2: --up: needs --camera")
+    assert "s.jsonl:1" not in problem
+
+
 @pytest.mark.parametrize(("place", "at", "moves"), [
     (None, None, True), (None, "24,24", True), ("0,0,-5", None, False),
 ])  # fmt: skip

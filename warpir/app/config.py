@@ -348,13 +348,15 @@ def _values_that_clash(config: InsertConfig) -> Iterator[InputError]:
 
 def _needs_of_scene(config: InsertConfig, given: Container[str]) -> Needs:
     """Yield (name, whether it has what it needs, what that is) of camera, light and output."""
-    yield "plane", "proxy" in given, "--proxy, without which there is no other ground"
+    # The lines of a sequence may name what its command line does not; each is checked by itself.
+    has_camera, has_proxy = (name in given or "sequence" in given for name in ("camera", "proxy"))
+    yield "plane", has_proxy, "--proxy, without which there is no other ground"
     yield "mitsuba", config.output.hand_off, "the files that --no-hand-off leaves out"
     yield "fit_lobes", "light" in given, "--light with a panorama to fit"
     yield "light_convention", "light" in given, "--light with a panorama"
-    yield "up", "camera" in given, "--camera; without a camera file the world is Y up"
+    yield "up", has_camera, "--camera; without a camera file the world is Y up"
     for name in ("frame", "undistort", "ground_points"):
-        yield name, "camera" in given, "--camera with a camera file"
+        yield name, has_camera, "--camera with a camera file"
     yield "sequence", "reuse" in given, "--reuse: one light for all frames"
     yield "fps", "sequence" in given, "--sequence, of which the video is made"
     is_demo_lit = "demo" in given and (config.guidance.kind == "none" or "refine" in given)
