@@ -302,6 +302,29 @@ def test_redraw_leaves_what_is_being_typed(inputs: Path, tmp_path: Path) -> None
 
 @needs_chromium
 @pytest.mark.slow
+def test_what_is_typed_counts_before_what_follows(inputs: Path, tmp_path: Path) -> None:
+    """A drag, Save and undo by keys take a number whose field was not left."""
+    out = tmp_path / "out"
+    with placing(command(inputs, out, "--size", "2"), 1000, 700) as opened:
+        page = opened.page
+        page.fill("#size", "1.25")
+        drag(opened, "turn", (30.0, 5.0))
+        dragged = page.evaluate(STATE)
+        assert dragged["size"] == 1.25 and dragged["turn"] != 0.0
+        page.fill("#size", "1.5")
+        press(opened, "Control+s")
+        page.wait_for_selector("#done:not([hidden])")
+        assert json.loads((out / "insert.json").read_text())["size"] == 1.5
+        page.fill("#height", "7")
+        press(opened, "Control+z")
+        assert page.evaluate(STATE)["stance"] == dragged["stance"]
+        assert page.input_value("#height") != "7"
+        press(opened, "Control+z", "Control+z", "Control+z")
+        assert page.evaluate(STATE)["size"] == 2.0
+
+
+@needs_chromium
+@pytest.mark.slow
 def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> None:
     """Save and the last field can be reached, and a second finger does not break a drag."""
     with placing(command(inputs, tmp_path / "out"), 640, 360) as opened:

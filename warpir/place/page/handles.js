@@ -1,6 +1,7 @@
 // What is dragged over the photo: horizon, ring, size, foot. Positions are pixels of the stage.
 
 import { clamp, corners, groundPoint, horizonRow, isShown, levelled, lowered, placed, pointSeen, project, zoomed } from './camera.js';
+import { takeTyped } from './history.js';
 
 const RIM = 14; // handles stay this far inside the stage
 const APART = 26; // between the middles of an object's knobs
@@ -122,6 +123,7 @@ function tilted(before, one, other) {
 // does. Other buttons do nothing, nor do other fingers while a gesture goes on.
 export function follow(element, pressed, gesture, name, moved, released = () => {}) {
   if (pressed.button !== 0 || gesture.isOn) return false;
+  takeTyped();
   element.setPointerCapture(pressed.pointerId);
   gesture.begin(name);
   const move = (event) => {

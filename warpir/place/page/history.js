@@ -2,6 +2,14 @@
 
 const PAUSE = 600; // ms between two keys that undo takes back one by one
 
+// Let what is being typed count before what follows; the field keeps the focus.
+export function takeTyped() {
+  const field = document.activeElement;
+  if (!field?.matches('input[type=number]')) return;
+  field.blur();
+  field.focus();
+}
+
 export class History {
   #past = [];
   #future = [];

@@ -3,7 +3,7 @@
 import { clamp } from './camera.js';
 import { Fields, fromPolar, plain, polar, wrapped } from './fields.js';
 import { Handles, shifted, stoodAt, withCamera } from './handles.js';
-import { History } from './history.js';
+import { History, takeTyped } from './history.js';
 import { Lamps } from './lamps.js';
 import { Dial, Lighting, photoPixels } from './light.js';
 import { Lines, Ruler } from './lines.js';
@@ -220,6 +220,7 @@ const UP_DOWN = { arrowup: 0, arrowright: 0, arrowdown: 1, arrowleft: 1 };
 window.addEventListener('keydown', (event) => {
   const key = event.key.toLowerCase();
   if (event.ctrlKey || event.metaKey) {
+    if ('zys'.includes(key)) takeTyped();
     if (key === 'z') (event.shiftKey ? history.redo() : history.undo());
     else if (key === 'y') history.redo();
     else if (key === 's') save();
