@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.builders.programs.browser import needs_chromium
-from tests.builders.programs.placing import STATE, command, placing, press
+from tests.builders.programs.placing import STATE, command, placing, press, settle
 from warpir.core.errors import InputError
 from warpir.place.renderings import Renderings, policy_of
 from warpir.place.worker import PATIENCE, Worker
@@ -134,6 +134,29 @@ def test_page_renders_what_insert_does(inputs: Path, tmp_path: Path) -> None:
     assert changed.sum() > 2000
     assert np.abs(shown - composite)[changed].mean() < 6.0
     assert np.abs(shown - composite)[~changed].mean() < 1.5
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_picture_is_that_of_its_own_state(inputs: Path, tmp_path: Path) -> None:
+    """One that is cancelled does not put the picture before it over another placement."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
+        page = opened.page
+        said = {"state": "done", "kind": "preview", "seconds": 1.0, "address": "photo.jpg"}
+        page.route("**/preview", lambda route: route.fulfill(json={}))
+        page.route("**/progress.json", lambda route: route.fulfill(json=said))
+        page.click("#preview")
+        page.wait_for_selector("#picture:not([hidden])")
+        page.locator("#stage").focus()
+        press(opened, "q")
+        said["state"] = "cancelled"
+        page.click("#preview")
+        page.get_by_text("Cancelled.").wait_for()
+        page.click("#zoom-in")  # draws all again
+        settle(opened)
+        assert page.locator("#picture").is_hidden()
+        press(opened, "Control+z")
+        assert page.locator("#picture").is_visible()
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ const STAGES = { starting: 'Starting', reading: 'Reading', light: 'Estimating th
 
 export class Pictures {
   #polls = false;
+  #asked = null; // the state whose preview this page waits for
 
   // `elements` has preview, insert, cancel, picture, bar, words, report; `page` has state,
   // placement(state), post(address, values), saved(state, command).
@@ -29,7 +30,7 @@ export class Pictures {
     try {
       const begun = await this.page.post(kind, this.page.placement(state));
       if (begun.command) this.page.saved(state, begun.command);
-      this.of = kind === 'preview' ? state : this.of;
+      this.#asked = kind === 'preview' ? state : null;
       await this.#wait();
     } catch (error) {
       this.#show({ state: 'failed', problem: error.message });
@@ -67,6 +68,7 @@ export class Pictures {
       this.report.hidden = false;
     } else {
       this.words.textContent = `Preview, ${seconds} s: the composite at low quality. Any change hides it.`;
+      this.of = this.#asked;
       this.picture.src = address;
       this.picture.decode().then(() => this.draw(this.page.state), () => {});
     }
