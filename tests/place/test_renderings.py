@@ -159,6 +159,31 @@ def test_picture_is_that_of_its_own_state(inputs: Path, tmp_path: Path) -> None:
         assert page.locator("#picture").is_visible()
 
 
+@needs_chromium
+@pytest.mark.slow
+def test_what_is_rendered_already_is_told(inputs: Path, tmp_path: Path) -> None:
+    """A page that was loaded again, and a second one, tell how far it is and can cancel it."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640, known="422") as opened:
+        page = opened.page
+        said = {"state": "running", "kind": "insert", "line": "light", "share": 0.5, "seconds": 3}
+        page.route("**/progress.json", lambda route: route.fulfill(json=said))
+        page.reload()
+        page.wait_for_selector("#cancel:not([hidden])")
+        assert page.locator("#preview").is_disabled()
+        said |= {"state": "done", "address": "result/report.html"}
+        page.wait_for_selector("#report:not([hidden])")
+        assert page.locator("#cancel").is_hidden()
+        refusal = {"where": "the page", "what": "rendered already", "advice": ""}
+        page.route("**/preview", lambda route: route.fulfill(status=422, json=refusal))
+        said |= {"state": "running", "kind": "preview"}
+        page.click("#preview")
+        page.wait_for_selector("#cancel:not([hidden])")
+        said |= {"state": "done", "address": "photo.jpg"}
+        page.wait_for_selector("#cancel", state="hidden")
+        assert page.locator("#picture").is_hidden()
+        assert page.inner_text("#rendering-words") == ""
+
+
 @pytest.mark.slow
 def test_preview_refuses_as_insert_does(inputs: Path, worker: Worker, tmp_path: Path) -> None:
     """A photo that went away is one line, and the next preview is answered again."""

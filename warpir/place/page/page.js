@@ -324,6 +324,7 @@ try {
   $('save').disabled = $('preview').disabled = $('insert').disabled = false;
   new ResizeObserver(() => view.show()).observe($('room'));
   warm(state);
+  pictures.follow();
 } catch (error) {
   $('loading').textContent = `The object cannot be shown: ${error.message}`;
 }

@@ -34,7 +34,15 @@ export class Pictures {
       await this.#wait();
     } catch (error) {
       this.#show({ state: 'failed', problem: error.message });
+      this.follow(); // what is in the way
     }
+  }
+
+  // Show how far that is which another page has begun, or this one before it was loaded again.
+  async follow() {
+    this.#asked = null;
+    const now = await fetch('progress.json').then((answer) => answer.json(), () => ({}));
+    if (now.state === 'running') await this.#wait().catch(() => {});
   }
 
   async #wait() {
@@ -66,11 +74,11 @@ export class Pictures {
       this.words.textContent = `Inserted in ${seconds} s. `;
       this.report.href = address;
       this.report.hidden = false;
-    } else {
+    } else if (this.#asked) {
       this.words.textContent = `Preview, ${seconds} s: the composite at low quality. Any change hides it.`;
       this.of = this.#asked;
       this.picture.src = address;
       this.picture.decode().then(() => this.draw(this.page.state), () => {});
-    }
+    } else this.words.textContent = ''; // of another page
   }
 }
