@@ -106,6 +106,22 @@ def test_page_opens_with_the_estimated_light(tmp_path: Path) -> None:
 
 @needs_chromium
 @pytest.mark.slow
+def test_estimated_colours_can_be_chosen_for_a_given_light(inputs: Path, tmp_path: Path) -> None:
+    """Also for a light of before the estimate, as undo brings it back."""
+    out = tmp_path / "out"
+    with placing(command(inputs, out, "--sky", "clear"), 1000, 700) as opened:
+        page = opened.page
+        page.uncheck("#keep-light")
+        page.wait_for_selector("#light:is([data-source=estimate], [data-source=unclear])")
+        press(opened, "Control+z")
+        assert page.input_value("#sky") == "clear"
+        page.select_option("#sky", "custom")
+        save(opened)
+    assert len(json.loads((out / "insert.json").read_text())["sky"]) == 3
+
+
+@needs_chromium
+@pytest.mark.slow
 def test_page_draws_no_sun_at_night(inputs: Path, tmp_path: Path) -> None:
     """Of a dark photo no direction is invented; one that is clicked is the user's."""
     noise = np.random.default_rng(0).normal(8.0, 2.0, (320, 480, 3))

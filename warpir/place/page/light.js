@@ -84,6 +84,7 @@ export class Lighting {
   // The same with the light changed, which the user wants from then on.
   set(before, change) {
     const light = { ...this.shown(before), isKept: true, ...change };
+    if (light.sky === 'custom') light.custom ??= this.estimate.sky; // chosen for a light of before it
     if (light.azimuth !== null || light.elevation !== null) {
       light.azimuth ??= 0;
       light.elevation ??= ELEVATION;
