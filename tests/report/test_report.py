@@ -683,6 +683,16 @@ def test_page_works_in_a_browser(browser: Opened, run: Run, tmp_path: Path) -> N
     assert stage.evaluate("e => e.clientWidth * devicePixelRatio") == SMALL[0] != fitting
     zoom.click()
     assert stage.evaluate("e => e.clientWidth") == fitting
+    # A view that is not shown meanwhile has the object in its middle, too.
+    compare.evaluate("e => { e.style.width = '20px'; e.style.height = '12px'; }")
+    scrolled = "e => [e.scrollLeft, e.scrollTop]"
+    zoom.click()
+    wanted = compare.evaluate(scrolled)
+    zoom.click()
+    seen.locator("input[value=view-object]").check(force=True)
+    zoom.click()
+    seen.locator("input[value=view-whole]").check(force=True)
+    assert compare.evaluate(scrolled) == wanted != [0, 0]
     assert browser.errors == []
     assert browser.requests == [(run.out / "report.html").as_uri()]
 

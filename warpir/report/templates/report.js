@@ -55,8 +55,11 @@ if (range) {
       const width = Number(view.querySelector("img").getAttribute("width"));
       view.classList.toggle("exact", isExact);
       stage.style.width = isExact ? width / window.devicePixelRatio + "px" : "";
+      const { hidden } = view;
+      view.hidden = false; // what is not laid out cannot be scrolled
       view.scrollLeft = Number(view.dataset.x || 0.5) * stage.clientWidth - view.clientWidth / 2;
       view.scrollTop = Number(view.dataset.y || 0.5) * stage.clientHeight - view.clientHeight / 2;
+      view.hidden = hidden;
     }
   });
 }
