@@ -1,6 +1,8 @@
 """The page's light: estimated from the photo, and without a direction where none is clear."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +74,19 @@ def test_worker_answers_refuses_and_starts_again(inputs: Path, worker: Worker) -
     assert worker.ask(job)["spread_deg"] > 0.0
     worker.stop()
     assert worker.ask(job)["spread_deg"] > 0.0
+
+
+@pytest.mark.slow
+def test_cancelled_picture_leaves_the_light(inputs: Path, worker: Worker) -> None:
+    """The light that is estimated before it is answered, however long that takes."""
+    camera = camera_from_fov(480, 320, 60.0, -8.0, 1.6).record()
+    job = {"kind": "light", "config": {"photo": str(inputs / "photo.png")}, "camera": camera}
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(worker.ask, job)
+        while not worker.is_running:
+            time.sleep(0.01)
+        worker.interrupt()
+        assert asked.result()["spread_deg"] > 0.0
 
 
 @needs_chromium

@@ -29,6 +29,7 @@ class Worker:
         self._is_asked = threading.Lock()
         self._is_closed = False
         self._job = 0
+        self._kind = ""
 
     def ask(
         self, job: Mapping[str, Any], heard: Callable[[dict[str, Any]], None] = lambda _: None
@@ -47,6 +48,7 @@ class Worker:
                 raise InputError("the page", "stopped before it was done", "", ExitCode.RESOURCES)
             process = self._running()
             self._job += 1
+            self._kind = job["kind"]
             assert process.stdin is not None and process.stdout is not None
             try:
                 process.stdin.write(json.dumps(job) + "\n")
@@ -66,9 +68,12 @@ class Worker:
         raise InputError("the page", "stopped before it was done", "", ExitCode.RESOURCES)
 
     def interrupt(self) -> None:
-        """Let the process give up its job, and end it where it does not do so soon."""
+        """Let the process give up its picture, and end it where it does not do so soon.
+
+        A light is estimated to its end: the page shows it whatever becomes of a picture.
+        """
         process = self._process
-        if process is None:
+        if process is None or self._kind == "light":
             return
         process.send_signal(signal.SIGUSR1)
 
