@@ -18,6 +18,7 @@ from tests.builders.programs.placing import (
     WIDTH,
     box_of,
     command,
+    drag,
     placing,
     press,
     save,
@@ -129,3 +130,21 @@ def test_page_paints_and_saves_what_stands_in_front(
         assert "occluder_mask" not in json.loads((out / "insert.json").read_text())
         assert not (out / "occluder.png").exists()
         # The test reads the canvas; the page does not.
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_other_tools_show_their_handles(inputs: Path, tmp_path: Path) -> None:
+    """Vanishing lines can be dragged though a mask was painted, or the handles were hidden."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 700) as opened:
+        page = opened.page
+        for hiding in ("#paint", "#guides"):
+            page.click(hiding)
+            assert page.locator("#handles").is_hidden()
+            page.click("#lines")
+            settle(opened)
+            before = page.evaluate(STATE)
+            drag(opened, "a00", (20.0, 10.0))
+            after = page.evaluate(STATE)
+            assert after["lines"] != before["lines"] and after["mask"] == []
+            page.click("#lines")

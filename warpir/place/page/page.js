@@ -262,6 +262,13 @@ $('guides').addEventListener('click', () => {
   $('handles').style.display = isShown ? '' : 'none';
   draw();
 });
+// Painting, and G, hide the handles that these are about.
+for (const tool of ['lines', 'ruler', 'add-lamp']) {
+  $(tool).addEventListener('click', () => {
+    if (mask.isPainting) $('paint').click();
+    if ($('guides').getAttribute('aria-pressed') !== 'true') $('guides').click();
+  });
+}
 $('save').addEventListener('click', save);
 $('copy').addEventListener('click', async () => {
   await navigator.clipboard.writeText($('command').textContent);
