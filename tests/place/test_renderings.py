@@ -184,6 +184,18 @@ def test_what_is_rendered_already_is_told(inputs: Path, tmp_path: Path) -> None:
         assert page.inner_text("#rendering-words") == ""
 
 
+@needs_chromium
+@pytest.mark.slow
+def test_page_tells_when_warpir_ends_in_a_picture(inputs: Path, tmp_path: Path) -> None:
+    """In its own words, not in those of the browser."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640, known="ERR_FAILED") as opened:
+        page = opened.page
+        page.route("**/preview", lambda route: route.fulfill(json={}))
+        page.route("**/progress.json", lambda route: route.abort())
+        page.click("#preview")
+        page.get_by_text("warpir.place is not running any more.").wait_for()
+
+
 @pytest.mark.slow
 def test_preview_refuses_as_insert_does(inputs: Path, worker: Worker, tmp_path: Path) -> None:
     """A photo that went away is one line, and the next preview is answered again."""

@@ -72,21 +72,26 @@ const pictures = new Pictures({
     return state;
   },
   placement: sentPlacement,
+  ask,
   post,
   saved: showSaved,
 });
 export const handles = new Handles($('handles'), $('stage'), start.asset, history);
 
-// Send values to warpir; returns its answer. The error's message is for the user.
-async function post(address, values) {
-  let answer;
+// What warpir answers to a request. Here and below the error's message is for the user.
+async function ask(address, request = {}) {
   try {
-    answer = await fetch(address, {
-      method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(values),
-    });
+    return await fetch(address, request);
   } catch {
     throw new Error('warpir.place is not running any more.');
   }
+}
+
+// Send values to warpir; returns its answer.
+async function post(address, values) {
+  const answer = await ask(address, {
+    method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(values),
+  });
   if (answer.ok) return answer.json();
   if (answer.status !== 422) throw new Error('warpir.place had a fault of its own; its terminal says more.');
   const { where, what, advice } = await answer.json();

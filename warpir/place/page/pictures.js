@@ -8,7 +8,7 @@ export class Pictures {
   #asked = null; // the state whose preview this page waits for
 
   // `elements` has preview, insert, cancel, picture, bar, words, report; `page` has state,
-  // placement(state), post(address, values), saved(state, command).
+  // placement(state), ask(address), post(address, values), saved(state, command).
   constructor(elements, page) {
     Object.assign(this, elements, { page });
     this.preview.addEventListener('click', () => this.#begin('preview'));
@@ -33,16 +33,20 @@ export class Pictures {
       this.#asked = kind === 'preview' ? state : null;
       await this.#wait();
     } catch (error) {
-      this.#show({ state: 'failed', problem: error.message });
+      this.#fail(error);
       this.follow(); // what is in the way
     }
+  }
+
+  #fail({ message }) {
+    this.#show({ state: 'failed', problem: message });
   }
 
   // Show how far that is which another page has begun, or this one before it was loaded again.
   async follow() {
     this.#asked = null;
-    const now = await fetch('progress.json').then((answer) => answer.json(), () => ({}));
-    if (now.state === 'running') await this.#wait().catch(() => {});
+    const now = await this.page.ask('progress.json').then((answer) => answer.json(), () => ({}));
+    if (now.state === 'running') await this.#wait().catch((error) => this.#fail(error));
   }
 
   async #wait() {
@@ -50,7 +54,7 @@ export class Pictures {
     this.#polls = true;
     try {
       for (;;) {
-        const now = await (await fetch('progress.json')).json();
+        const now = await (await this.page.ask('progress.json')).json();
         this.#show(now);
         if (now.state !== 'running') break;
         await new Promise((resolve) => { setTimeout(resolve, PAUSE); });
