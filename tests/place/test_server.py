@@ -6,6 +6,7 @@ import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -151,6 +152,18 @@ def test_address_leaves_out_the_port_of_http() -> None:
     for port, host in ((80, "127.0.0.1"), (8080, "127.0.0.1:8080")):
         server.server_address = ("127.0.0.1", port)
         assert server.host == host
+
+
+def test_placements_are_saved_one_at_a_time() -> None:
+    """Whether by Save or by Full render: two at once took each other's files for somebody's."""
+    from warpir.place.server import PlaceServer
+
+    server = object.__new__(PlaceServer)
+    server.working = threading.Lock()
+    names = ("save", "insert", "preview")
+    server.answers = {n: lambda _: {"alone": server.working.locked()} for n in names}
+    alone = {name: server.answer(name, b"")["alone"] for name in names}
+    assert alone == {"save": True, "insert": True, "preview": False}
 
 
 def test_demo_starts_where_the_user_says() -> None:

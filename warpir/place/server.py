@@ -67,8 +67,9 @@ class PlaceServer(ThreadingHTTPServer):
         contents: Functions that build the other files, by address; each is called once, when its
             file is first requested.
         answers: By address, what is called with the bytes that the page sends there and returns the
-            answer, in a thread of each request's own. ``save`` is among them; it is called while
-            nothing else is read, built or saved. Each raises `InputError`.
+            answer, in a thread of each request's own. ``save`` is among them; it and ``insert``,
+            which saves, are called while nothing else is read, built or saved. Each raises
+            `InputError`.
         changing: Returns a file that may be another one the next time, by its address; None where
             there is none.
         once: Whether the first placement that was saved ends `serve_forever`.
@@ -126,7 +127,7 @@ class PlaceServer(ThreadingHTTPServer):
         Raises:
             InputError: It cannot be used.
         """
-        with self.working if name == "save" else nullcontext():
+        with self.working if name in ("save", "insert") else nullcontext():
             return self.answers[name](body)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
