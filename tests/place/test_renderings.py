@@ -52,7 +52,7 @@ def test_one_picture_at_a_time_and_cancelled() -> None:
 
 
 def test_files_of_results_only(tmp_path: Path) -> None:
-    """Of a result the files that its record names can be read, and none before it is there."""
+    """Of a result its record and the files named there can be read, and none before it is there."""
     renderings = Renderings(Silent())
     try:
         for name in ("a.png", "other.txt", "run.json"):
@@ -61,6 +61,7 @@ def test_files_of_results_only(tmp_path: Path) -> None:
         assert renderings.file("result/a.png") is None
         renderings._results = tmp_path
         assert renderings.file("result/a.png") is not None
+        assert renderings.file("result/run.json") is not None  # the report links it
         for name in ("result/other.txt", "result/../secret", "result/", "a.png", "preview-1.png"):
             assert renderings.file(name) is None
     finally:

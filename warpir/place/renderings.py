@@ -111,7 +111,8 @@ class Renderings:
         if self._results is None or folder != "result" or not slash:
             return None
         with suppress(InputError):
-            if rest in read_json_object(self._results / "run.json")["files"]:
+            record = read_json_object(self._results / "run.json")
+            if rest in (*record["files"], "run.json"):
                 return _content(self._results / rest)
         return None
 
