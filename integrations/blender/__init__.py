@@ -16,7 +16,7 @@ from .job import Failure, Job
 _jobs: list[Job] = []
 """The one that is running, if any."""
 PYTHON = "The interpreter of the environment into which warpir was installed"
-FLAGS = "Of python -m warpir.insert, such as --fov 50 --camera-height 1.2"
+FLAGS = "Of python -m warpir.insert for the {}, such as {}"
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -31,7 +31,14 @@ class Settings(bpy.types.PropertyGroup):
     """A scene's; ``light`` is the folder of the last estimate, ``result`` of the last run."""
 
     samples: IntProperty(name="Samples", description="Per pixel", default=64, min=1, max=4096)
-    flags: StringProperty(name="More flags", description=FLAGS)
+    estimate_flags: StringProperty(
+        name="Flags of the estimate",
+        description=FLAGS.format("estimate", "--fov 50 --camera-height 1.2"),
+    )
+    flags: StringProperty(
+        name="Flags of the insertion",
+        description=FLAGS.format("insertion", "--sharpness off --grain off"),
+    )
     light: StringProperty()
     light_of: StringProperty(description="The estimate's photo")
     result: StringProperty()
@@ -158,10 +165,11 @@ class Panel:
         except Failure as error:
             layout.label(text=str(error), icon="INFO")
         layout.operator("warpir.photo", icon="FILEBROWSER")
+        layout.prop(scene.warpir, "estimate_flags")
         layout.operator("warpir.estimate", icon="LIGHT_SUN")
-        layout.operator("warpir.insert", icon="RENDER_STILL")
         layout.prop(scene.warpir, "samples")
         layout.prop(scene.warpir, "flags")
+        layout.operator("warpir.insert", icon="RENDER_STILL")
         for job in _jobs:
             layout.progress(factor=job.share, text=job.lines[-1][:80] or "Starting warpir")
             layout.operator("warpir.cancel", icon="CANCEL")

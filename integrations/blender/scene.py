@@ -59,7 +59,8 @@ def new_folder(name: str) -> Path:
 def estimate_arguments(context: Any, folder: Path) -> list[str]:
     """Return what the environment's Python is asked for camera and light of the photo."""
     script, photo = Path(__file__).with_name("estimate.py"), photo_of(context.scene)[1]
-    return [str(script), str(photo), str(folder), *shlex.split(context.scene.warpir.flags)]
+    flags = shlex.split(context.scene.warpir.estimate_flags)
+    return [str(script), str(photo), str(folder), *flags]
 
 
 def show_estimate(scene: Any, folder: Path) -> None:

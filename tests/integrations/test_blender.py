@@ -13,8 +13,9 @@ import time
 import tomllib
 import zipfile
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -124,6 +125,29 @@ def test_job_needs_a_python(job: ModuleType, tmp_path: Path) -> None:
             job.Job(python, [], tmp_path)
 
 
+def test_flags_go_to_their_own_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An insertion takes the estimate's camera and light, and no flags that state them again."""
+    package = ModuleType("warpir_blender")
+    package.__path__ = [str(FOLDER)]
+    monkeypatch.setitem(sys.modules, "bpy", MagicMock())
+    monkeypatch.setitem(sys.modules, package.__name__, package)
+    scenes = importlib.import_module("warpir_blender.scene")
+    for name in ("scene", "job", "compositor"):
+        monkeypatch.delitem(sys.modules, f"warpir_blender.{name}")
+    background = SimpleNamespace(image=SimpleNamespace(size=(48, 32)))
+    monkeypatch.setattr(scenes, "photo_of", lambda scene: (background, tmp_path / "photo.png"))
+    monkeypatch.setattr(scenes, "_bounds", lambda context, things: (np.zeros(3), np.ones(3)))
+    monkeypatch.setattr(scenes, "_camera_record", lambda context, width, height: {})
+    context = MagicMock(selected_objects=[MagicMock(type="MESH")])
+    context.scene.warpir.estimate_flags = "--fov 50 --camera-height 1.2"
+    context.scene.warpir.flags = "--ground-roughness 0.2"
+    context.scene.warpir.light = str(tmp_path)
+    asked = scenes.estimate_arguments(context, tmp_path)
+    assert asked[-4:] == ["--fov", "50", "--camera-height", "1.2"]
+    asked = scenes.insert_arguments(context, tmp_path)
+    assert asked[-2:] == ["--ground-roughness", "0.2"] and "--fov" not in asked
+
+
 # ------------------------------------------------------------------------------ in a real Blender
 
 DRIVER = """
@@ -165,9 +189,8 @@ image = scene.camera.data.background_images[0].image
 image.filepath = out + "/moved.png"
 saw["moved"] = refused(warpir.estimate)
 image.filepath = photo
-scene.warpir.flags = "--fov 900"
+scene.warpir.estimate_flags = "--fov 900"
 saw["flag"] = refused(warpir.estimate)
-scene.warpir.flags = ""
 
 # With a window Blender goes on: a timer looks, and cancels
 manager = bpy.context.window_manager
@@ -195,7 +218,7 @@ while (state := run.modal(stand_in, bpy.context, tick)) == {"PASS_THROUGH"}:
     time.sleep(0.05)
 saw["cancelled"] = [*state, *said]
 
-scene.warpir.flags = "--no-report"
+scene.warpir.estimate_flags = "--camera-height 1.6 --no-report"
 assert warpir.estimate() == {"FINISHED"}
 saw["norep"] = refused(warpir.report)
 saw["objects"] = sorted((o.name, o.type) for o in scene.objects)
@@ -208,7 +231,7 @@ car = bpy.context.selected_objects[0]
 car.rotation_mode = "XYZ"
 car.rotation_euler.z += 0.6
 car.location.y += 7.0
-scene.warpir.flags, scene.warpir.samples = "", 64
+scene.warpir.samples = 64
 assert warpir.insert() == {"FINISHED"}
 saw["result"], saw["light"] = scene.warpir.result, scene.warpir.light
 width, height = scene.render.resolution_x, scene.render.resolution_y
