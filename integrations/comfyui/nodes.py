@@ -40,6 +40,12 @@ def _output(name: str) -> Path:
     return Path(tempfile.mkdtemp(prefix=f"warpir-{name}-", dir=root))
 
 
+def _is_of_a_node(light: str) -> bool:
+    """Return whether a light map is one of these nodes' results: its level is the photo's."""
+    own = tuple(f"warpir-{name}-" for name in ("light", "insertion"))
+    return any(part.startswith(own) for part in Path(light).parts[-3:-1])
+
+
 def _camera(image: Tensor) -> Any:
     from warpir.calibration.estimate import estimate_camera
 
@@ -156,7 +162,7 @@ class InsertObject:
                 "asset": ("STRING", {"default": "", "tooltip": tips}),
             },
             "optional": {
-                "at_x": number(-1.0, -1.0, 1.0, "Column where it stands, a share; -1: free ground"),
+                "at_x": number(-1.0, -1.0, 1.0, "Column where it stands, a share; both -1: chosen"),
                 "at_y": number(-1.0, -1.0, 1.0, "Row of the ground where it stands, a share"),
                 "size": number(0.0, 0.0, 1000.0, "Its longest side [m]; 0: as the file has it"),
                 "rotate_y": number(0.0, -360.0, 360.0, "Turn about the vertical [deg]"),
@@ -184,13 +190,17 @@ class InsertObject:
         from warpir import insert
         from warpir.app.config import InsertConfig
 
+        if (at_x < 0.0) != (at_y < 0.0):
+            raise ValueError("at_x and at_y: give both, or leave both at -1")
         folder = _output("insertion")
         photo = _photo(image)
         Image.fromarray(np.uint8(np.round(photo * 255.0))).save(folder / "photo.png")
         values = {name: value for name, value in asked.items() if value not in ("", 0.0)}
         values |= {"photo": str(folder / "photo.png"), "asset": asset}
         values["out"] = str(folder / "result")
-        if at_x >= 0.0 and at_y >= 0.0:
+        if _is_of_a_node(values.get("light", "")):
+            values["exposure"] = 0.0
+        if at_x >= 0.0:
             values["at"] = (at_x * photo.shape[1], at_y * photo.shape[0])
         # A photo without alpha has an empty mask, of no particular size.
         if occluder is not None and bool(occluder.any()):

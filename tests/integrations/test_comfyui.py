@@ -122,6 +122,25 @@ def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
     assert (Path(folder) / "report.html").is_file() and Path(light).is_file()
 
 
+def test_linked_light_keeps_its_level(nodes: ModuleType, tmp_path: Path) -> None:
+    """The estimated map has the photo's level, which another map is scaled to."""
+    write_inputs(tmp_path)
+    photo = image_of(tmp_path / "photo.png")
+    estimated = called(nodes, "WarpirEstimateLight", image=photo)[0]
+    inputs = {"image": photo, "asset": str(tmp_path / "box.obj"), "size": 0.4, "samples": 1}
+    *_, linked, folder = called(nodes, "WarpirInsertObject", light=estimated, **inputs)
+    assert json.loads((Path(folder) / "run.json").read_text())["config"]["exposure"] == 0.0
+    *_, folder = called(nodes, "WarpirInsertObject", light=linked, **inputs)
+    assert json.loads((Path(folder) / "run.json").read_text())["config"]["exposure"] == 0.0
+    *_, folder = called(nodes, "WarpirInsertObject", light=str(tmp_path / "sky.hdr"), **inputs)
+    assert json.loads((Path(folder) / "run.json").read_text())["config"]["exposure"] is None
+
+
+def test_half_a_place_is_refused(nodes: ModuleType) -> None:
+    with pytest.raises(ValueError, match="at_x and at_y"):
+        called(nodes, "WarpirInsertObject", image=torch.zeros(1, 8, 8, 3), asset="", at_y=0.8)
+
+
 @pytest.mark.slow
 def test_a_model_guides(nodes: ModuleType, tmp_path: Path) -> None:
     """It needs derivatives, which ComfyUI turns off round a node."""
