@@ -59,7 +59,7 @@ def write_usdz(
         _object(stage, asset, asset_to_world)
         _camera(stage, camera)
         dome = UsdLux.DomeLight.Define(stage, "/scene/light")
-        dome.CreateTextureFileAttr(Sdf.AssetPath("envmap.exr"))
+        dome.CreateTextureFileAttr(Sdf.AssetPath("./envmap.exr"))
         dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
         for k, lamp in enumerate(lamps):
             _lamp(stage, lamp, f"/scene/lamp_{k}")
@@ -186,7 +186,7 @@ def _material(
         read.CreateInput("varname", TYPES.String).Set(names[slot.uv_set, slot.transform])
         image = UsdShade.Shader.Define(stage, f"{path}/{name}_texture")
         image.CreateIdAttr("UsdUVTexture")
-        image.CreateInput("file", TYPES.Asset).Set(Sdf.AssetPath(f"texture_{slot.texture}.png"))
+        image.CreateInput("file", TYPES.Asset).Set(Sdf.AssetPath(f"./texture_{slot.texture}.png"))
         image.CreateInput("st", TYPES.Float2).ConnectToSource(read.ConnectableAPI(), "result")
         texture, is_color = asset.textures[slot.texture], kind == rgb or channel == "a"
         space = "sRGB" if is_color else "raw"
