@@ -20,6 +20,7 @@ from warpir.optimize.light import LampPowers, LightOptimization, Unknowns
 from warpir.optimize.loop import Guide
 from warpir.optimize.view import Frame
 from warpir.render.near.rows import with_lamps
+from warpir.scene.camera import Camera
 from warpir.scene.near.lamps import Lamp, SphereLamp
 
 LAMPS = (
@@ -97,6 +98,8 @@ def test_powers_of_lamps_are_found(integrator: str, device: str) -> None:
     for given, found in zip(LAMPS, lamps.found(), strict=True):
         assert isinstance(found, SphereLamp) and found.radius == given.radius
     written = lamps_to_json(lamps.found())["lamps"]
+    powers = ", ".join(f"{lamp['power']:.3g}" for lamp in written)
+    assert loop.describe(Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.eye(4))).endswith(f"power {powers}")
     again = lamps_of(__file__, written)  # type: ignore[arg-type]
     for one, other in zip(again, lamps.found(), strict=True):
         np.testing.assert_allclose(one.power, other.power, rtol=1e-12)

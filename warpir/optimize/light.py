@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from warpir.app.settings import OptimizeSettings
-from warpir.core.color import luminance
 from warpir.lighting.fusion import fuse
 from warpir.lighting.regularizers import TrustRegion, bend, chroma, consistency, spread
 from warpir.lighting.sg_light import LightBounds, SGLight, bounded_ratios, narrowest
@@ -318,7 +317,7 @@ class LightOptimization(Optimization):
         lamps = self.unknowns.lamps
         if lamps is None:
             return words
-        powers = (f"{float(luminance(lamp.power)):.3g}" for lamp in lamps.found())
+        powers = (f"{lamp.power.max():.3g}" for lamp in lamps.found())
         return f"{words}; lamps of power {', '.join(powers)}"
 
     def project(self) -> None:
