@@ -67,7 +67,7 @@ def read_curves(path: str | Path, limits: Limits = LIMITS) -> Curves:
     is_clipped = root.get("is_clipped", True)
     if not isinstance(is_clipped, bool):
         raise InputError(path, f"/is_clipped: true or false expected (found {is_clipped!r:.40})")
-    return Curves(str(tone), knots["foreground"], knots["shadow_ratio"], is_clipped)
+    return Curves(str(tone), knots["foreground"], knots["shadow_ratio"], is_clipped=is_clipped)
 
 
 def _read_knots(path: str | Path, pointer: str, value: Any) -> ToneKnots:

@@ -106,12 +106,10 @@ def place_asset(
     Raises:
         InputError: The place is not on the visible ground, or the camera cannot see the object.
     """
-    assumed: list[str] = []
+    assumed = ["the ground is the plane y = 0"] if ground is None else []
     warnings: list[str] = []
     origin = camera.c2w[:3, 3]
     plane = upright_plane(ground, origin)
-    if ground is None:
-        assumed.append("the ground is the plane y = 0")
     if place is not None:
         stand = np.asarray(place, dtype=np.float64)
         if is_plane:
@@ -122,24 +120,17 @@ def place_asset(
             assumed.append(f"the object stands at pixel {at[0]:g},{at[1]:g} (--at, --place)")
         stand, steep = _point_at_pixel(at, camera, plane, mesh, is_plane)
         warnings += steep
-
     scale = _scale_of(high - low, scale, size, assumed, warnings)
     rotation = turn(plane[:3], math.radians(rotate_y)) @ y_to(plane[:3])
     asset_to_world = _standing(low, high, scale, rotation, stand)
     shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
     where = "--at" if place is None else "--place"
-    corners = box_corners(low, high)
-    _refuse_within(where, shown, corners, asset_to_world, camera)
-    try:
-        is_seen, (seen, cut) = True, _in_view(where, corners, asset_to_world, camera)
-    except InputError as error:
-        if must_be_seen:
-            raise
-        is_seen, (seen, cut) = False, ("not in the photo", [error.what])
-    warnings += cut
-    away = float(np.linalg.norm(stand - origin))
-    summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
-    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings), summary, is_seen)
+    standing = where, box_corners(low, high), asset_to_world, camera
+    _refuse_within(shown, *standing)
+    is_seen, seen, cut = _in_view(*standing, must_be_seen)
+    away = f"{np.linalg.norm(stand - origin):.3g} m from the camera"
+    summary = f"the object of {shown} m stands {away}, {seen}"
+    return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings + cut), summary, is_seen)
 
 
 def settled(
@@ -375,7 +366,7 @@ def box_corners(low: Float64Array, high: Float64Array) -> Float64Array:
 
 
 def _refuse_within(
-    where: str, size: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
+    size: str, where: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
 ) -> None:
     """Refuse an object whose bounding box holds the camera."""
     eye = np.linalg.solve(asset_to_world, camera.c2w[:, 3])[:3]
@@ -393,26 +384,34 @@ def _refuse_within(
 
 
 def _in_view(
-    where: str, corners: Float64Array, asset_to_world: Float64Array, camera: Camera
-) -> tuple[str, list[str]]:
-    """Return where in the photo an object is, and warnings.
+    where: str,
+    corners: Float64Array,
+    asset_to_world: Float64Array,
+    camera: Camera,
+    must_be_seen: bool,
+) -> tuple[bool, str, list[str]]:
+    """Return whether and where an object is in the photo, and warnings.
 
     The bounding box is tested, so an object that just fits may be reported as cut.
 
     Raises:
-        InputError: The camera cannot see it.
+        InputError: It must be seen, and the camera cannot see it.
     """
     pixels = camera.project(corners @ asset_to_world[:3, :3].T + asset_to_world[:3, 3])
     seen = pixels[np.isfinite(pixels).all(axis=1)]
-    if len(seen) == 0:
-        raise InputError(where, "the object is behind the camera", "the camera looks along -Z")
-    if len(seen) < len(pixels):
-        return "partly behind it", ["the object reaches behind the camera"]
-    (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
-    box = f"columns {left:.0f} to {right:.0f}, rows {top:.0f} to {bottom:.0f}"
-    frame = f"the photo is {camera.width} x {camera.height}"
-    if right <= 0.0 or bottom <= 0.0 or left >= camera.width or top >= camera.height:
-        raise InputError(where, f"the object is outside the photo ({box}; {frame})")
-    if left < 0.0 or top < 0.0 or right > camera.width or bottom > camera.height:
-        return f"its box in {box}", [f"the object may be cut by the photo's edge ({box}; {frame})"]
-    return f"its box in {box}", []
+    if 0 < len(seen) < len(pixels):
+        return True, "partly behind it", ["the object reaches behind the camera"]
+    unseen = InputError(where, "the object is behind the camera", "the camera looks along -Z")
+    if len(seen):
+        (left, top), (right, bottom) = seen.min(axis=0), seen.max(axis=0)
+        box = f"columns {left:.0f} to {right:.0f}, rows {top:.0f} to {bottom:.0f}"
+        frame = f"the photo is {camera.width} x {camera.height}"
+        if min(left, top) >= 0.0 and right <= camera.width and bottom <= camera.height:
+            return True, f"its box in {box}", []
+        if right > 0.0 and bottom > 0.0 and left < camera.width and top < camera.height:
+            cut = f"the object may be cut by the photo's edge ({box}; {frame})"
+            return True, f"its box in {box}", [cut]
+        unseen = InputError(where, f"the object is outside the photo ({box}; {frame})")
+    if must_be_seen:
+        raise unseen
+    return False, "not in the photo", [unseen.what]

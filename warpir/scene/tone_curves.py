@@ -8,7 +8,7 @@ parameters that are optimised, `warpir.kernels.tone` the device's evaluation,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -132,7 +132,7 @@ class Curves:
     """One curve."""
     shadow_ratio: ToneKnots
     """Three curves, red, green and blue."""
-    is_clipped: bool = True
+    is_clipped: bool = field(default=True, kw_only=True)
     """Whether the object ends at 1 where there is no operator, as in a photo; not on a linear
     plate."""
 

@@ -80,7 +80,9 @@ def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -
     frames = read_sequence(config, loaders, renews=renews, look_at=look_at)
     if len(poses) > 1:
         how = "at its pixel" if config.placement.at is not None else "where it is seen"
-        say(f"notice: the camera moves, and the object is set {how} in each frame anew: it moves "
-            "with the camera (--place keeps it where it stands)")  # fmt: skip
+        say(
+            f"notice: the camera moves, and the object is set {how} in each frame anew: it moves "
+            "with the camera (--place keeps it where it stands)"
+        )
     refuse_other_page(config)
     return frames
