@@ -44,6 +44,7 @@ from warpir.report.html import source_hash
 from warpir.report.panorama import rgbe
 from warpir.report.pictures import layers_shown, shrink, thumbnail
 from warpir.report.plots import Series, line_plot, ticks
+from warpir.report.remedies import remedies
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&"
 """As a prompt or, without the slash, as a name of a file."""
@@ -221,6 +222,21 @@ def test_what_to_change_are_commands_that_are_understood(
         named = {w[2:].replace("-", "_") for w in words if w.startswith("--")} - {"config"}
         assert {k for k, v in changed.items() if v != asked.flat()[k]} <= named, words
         assert changed["out"] == "OUT"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"), [([], "--sun"), (["--guidance=none"], "--light-rotate")]
+)
+def test_what_to_change_of_the_demos_light_is_understood(given: list[str], told: str) -> None:
+    """An estimated light is replaced, the demo's own is turned."""
+    light = {"azimuth_deg": 0.0, "elevation_deg": 45.0}
+    measured = {"light": light, "exposure_ev": 0.0, "samples": 40, "placement": {}}
+    asked = parse(["--demo", *given, "--out", "out"]).config
+    found = remedies(asked, {"measured": measured}, None)[0]
+    words = shlex.split(found.command)
+    assert told in words
+    parse(["--demo", *given, *words[words.index("run.json") + 1 :]])
+    assert (told == "--sun") or "counter-clockwise" in found.about
 
 
 def test_page_tells_no_folder(run: Run, page: str, folder: Path) -> None:

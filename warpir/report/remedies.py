@@ -71,9 +71,10 @@ def remedies(
 def _light(asked: Mapping[str, Any], measured: Mapping[str, Any]) -> Iterator[Remedy]:
     azimuth, elevation = (round(measured["light"][f"{n}_deg"]) for n in ("azimuth", "elevation"))
     fault = "The shadow falls to the wrong side"
-    if asked["light"] is not None or asked["reuse"] is not None or asked["demo"]:
+    is_demo_lit = asked["demo"] and asked["guidance"] == "none"
+    if asked["light"] is not None or asked["reuse"] is not None or is_demo_lit:
         turned = (asked["light_rotate"] or 0.0) + 30.0
-        about = "turns the light clockwise as seen from above [degrees]"
+        about = "turns the light counter-clockwise as seen from above [degrees]"
         yield Remedy(fault, again(asked, light_rotate=turned), about)
     else:
         sky = {} if asked["sky"] is not None else {"sky": "clear"}
