@@ -15,6 +15,7 @@ from tests.lighting.test_regressor import HELD_OUT, SMALL, TOY, blobs
 from warpir.core.errors import ExitCode
 from warpir.train import command
 from warpir.train.command import main
+from warpir.train.networks.calibrator import random_calibrator, save_calibrator
 from warpir.train.networks.regressor import random_regressor, save_regressor
 from warpir.train.places import learned_from
 from warpir.train.regressor import train_regressor
@@ -28,6 +29,7 @@ torch.set_num_threads(1)
 from dataclasses import replace
 from pathlib import Path
 from tests.lighting.test_regressor import HELD_OUT, SMALL, TOY, blobs
+from warpir.train.networks.calibrator import random_calibrator, save_calibrator
 from warpir.train.networks.regressor import random_regressor
 from warpir.train.regressor import train_regressor
 from warpir.train.worker import Worker
@@ -183,6 +185,21 @@ def test_training_looks_before_it_begins(
     assert main(argv) == code
     assert words in capsys.readouterr().err.splitlines()[0]
     assert held.is_dir() and not (tmp_path / "new").exists()
+
+
+def test_validation_on_what_was_learned_from_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = tmp_path / "start.safetensors"
+    save_calibrator(random_calibrator(0), start, {"panoramas": ["a_noon"], "started_from": None})
+    for place in ("a_noon", "b_noon"):
+        write_envmap(tmp_path / place, place, np.full((16, 32, 3), 0.5, np.float32))
+    monkeypatch.setattr("warpir.train.camera.loop.train_camera", lambda *_, **__: None)
+    argv = ["camera", "--panoramas", str(tmp_path), "--out", str(tmp_path / "out")]
+    argv += ["--device", "cpu", "--start", str(start), "--validation"]
+    for place, count in (("a_noon", 1), ("b_noon", 0)):
+        assert main([*argv, place]) == ExitCode.DONE
+        assert capsys.readouterr().out.count("notice: validation on 1 panoramas that") == count
 
 
 def test_no_training_outlives_one_that_failed(

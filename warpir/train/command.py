@@ -124,6 +124,7 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
     watched = [p for p in panoramas if p.stem in watched_names]
     if worker.is_first:
         say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)} panoramas")
+        _say_known(watched, known)
     torch_device = torch.device(device)
     record = {
         "panoramas": [p.stem for p in learned],
@@ -146,7 +147,7 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     from warpir.train.lights import SKY_ONLY
     from warpir.train.networks.calibrator import random_calibrator, read_calibrator
     from warpir.train.networks.regressor import read_regressor
-    from warpir.train.places import of_fold
+    from warpir.train.places import learned_from, of_fold
     from warpir.train.stepping import CameraSettings
 
     device = torch.device(choose_device(options.device))
@@ -161,6 +162,7 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
     say(f"device: {device}; {len(learned)} panoramas; validation on {len(watched)}")
     start = None if options.start is None else read_calibrator(options.start, device)
     started_from = None if start is None else start.record
+    _say_known(watched, learned_from(started_from or {}))
     if options.regressor is not None:
         regressor = read_regressor(options.regressor)
         start = start or random_calibrator(options.seed)
@@ -188,6 +190,14 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
         start=start,
         record=record,
     )
+
+
+def _say_known(watched: Sequence[Path], known: set[str]) -> None:
+    """Say how many panoramas judge a network that begins with weights that know them."""
+    count = sum(p.stem in known for p in watched)
+    if count:
+        words = "that the weights of --start have learned from: errors elsewhere are larger"
+        say(f"notice: validation on {count} panoramas {words}")
 
 
 def _began_with(options: argparse.Namespace) -> Mapping[str, Any]:
