@@ -658,19 +658,6 @@ def test_training_takes_a_step_whatever_the_time(
     assert told[0].startswith("step 1, ") and told[1] == "calibrating the best weights"
 
 
-def test_training_goes_on_with_its_own_panoramas(tmp_path: Path) -> None:
-    """What is judged by must not be learned from, nor the other way about, after --resume."""
-    tiny = replace(TOY, batch=2, step_limit=1)
-    start, record = random_regressor(0, SMALL), {"panoramas": ["a"], "validation_panoramas": ["b"]}
-    train_regressor(blobs, HELD_OUT, tmp_path, tiny, "cpu", 1.0, 1.0, network=start, record=record)
-    for changed in ({"panoramas": ["a", "b"]}, {"validation_panoramas": []}):
-        with pytest.raises(InputError, match=r"with other \w+ \(b\)"):
-            train_regressor(
-                blobs, HELD_OUT, tmp_path, tiny, "cpu", 1.0, 1.0, resume=True,
-                record=record | changed,
-            )  # fmt: skip
-
-
 def test_training_collects_the_mean_light(tmp_path: Path) -> None:
     """Where every scene has the same levels, the mean training light has them too."""
     end = replace(TOY, batch=32, step_limit=2)

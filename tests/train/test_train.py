@@ -238,7 +238,7 @@ def test_training_begins_with_one_network(
 
 
 def test_what_is_resumed_knows_what_it_began_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its folds stay, and its record still names the panoramas behind the weights of --start."""
     start, out = tmp_path / "start.safetensors", tmp_path / "out"
@@ -263,3 +263,8 @@ def test_what_is_resumed_knows_what_it_began_with(
         assert main([*argv, "--fold", "0/3", *more]) == ExitCode.DONE
     assert records[0]["validation_panoramas"] and records[0] == records[1]
     assert "older_noon" in learned_from(records[1])
+    # What is judged by must not be learned from, nor the other way about.
+    for other in (["--fold", "1/3"], ["--fold", "0/3", "--without", "a_noon"]):
+        assert main([*argv, *other, "--resume"]) == ExitCode.INPUT
+        assert "a training with other panoramas" in capsys.readouterr().err
+    assert len(records) == 2

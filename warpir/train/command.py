@@ -113,7 +113,8 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
     worker = Worker.this()
     device = choose_device(f"cuda:{worker.local_rank}" if worker.count > 1 else options.device)
     names = [p.stem for p in panoramas if p.stem not in options.without]
-    began_with = _began_with(options)
+    held = _held_record(options.out) if options.resume else {}
+    began_with = held.get("started_from", {}) if options.resume else _start_record(options.start)
     known = learned_from(began_with)
     watched_names = {*options.validation, *of_fold(names, options.fold, known)}
     kept_out = {*options.without, *watched_names}
@@ -133,6 +134,8 @@ def _train_regressor(options: argparse.Namespace, panoramas: Sequence[Path]) -> 
         "device": torch.cuda.get_device_name(torch_device) if device != "cpu" else "cpu",
         "started_from": began_with,
     }
+    if options.resume:
+        _compare(options.out, held, record)
     pools = load_panoramas(learned, torch_device), load_panoramas(watched, torch_device)
     return _train_on(pools, options, options.seed * 1000 + worker.local_rank, torch_device, record)
 
@@ -200,22 +203,42 @@ def _say_known(watched: Sequence[Path], known: set[str]) -> None:
         say(f"notice: validation on {count} panoramas {words}")
 
 
-def _began_with(options: argparse.Namespace) -> Mapping[str, Any]:
-    """Return the record of the regressor that this training began with; empty without any."""
-    if options.resume:
-        from warpir.train.regressor import checkpoints_of
+def _held_record(out: Path) -> Mapping[str, Any]:
+    """Return the record of the training in a folder."""
+    from warpir.train.regressor import checkpoints_of
 
-        # `train_regressor` tells of checkpoints that are damaged.
-        held = checkpoints_of(options.out).load(lambda _: None).state
-        return held.get("record", {}).get("started_from", {})  # type: ignore[no-any-return]
-    if options.start is None:
+    # `train_regressor` tells of checkpoints that are damaged.
+    state = checkpoints_of(out).load(lambda _: None).state
+    return state.get("record", {})  # type: ignore[no-any-return]
+
+
+def _compare(out: Path, held: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Compare the panoramas of a training in its folder with those that it would go on with.
+
+    Raises:
+        InputError: They differ: what is judged by must not have been learned from.
+    """
+    for name in ("panoramas", "validation_panoramas"):
+        was, now = (set(r.get(name, ())) for r in (held, record))
+        if was != now:
+            what = f"a training with other {name} ({', '.join(sorted(was ^ now))})"
+            raise InputError(out, what, "give the same again, or choose another --out")
+
+
+def _start_record(start: Path | None) -> Mapping[str, Any]:
+    """Return the record of the regressor to begin with; empty without any.
+
+    Raises:
+        InputError: It is not one network (`ExitCode.MODEL`).
+    """
+    if start is None:
         return {}
     from warpir.lighting.regressor import load_regressor
 
-    network = load_regressor(options.start)
+    network = load_regressor(start)
     if len(network.members) > 1:
         what = f"holds {len(network.members)} networks, and a training begins with one"
-        raise InputError(options.start, what, code=ExitCode.MODEL)
+        raise InputError(start, what, code=ExitCode.MODEL)
     return network.record
 
 

@@ -97,8 +97,7 @@ def train_regressor(
         record: Put into the weights file beside what is known here; plain values.
 
     Raises:
-        InputError: Nothing to resume from, no checkpoint that is whole, or one of a training on
-            other panoramas.
+        InputError: Nothing to resume from, or no checkpoint that is whole.
     """
     began, device, worker = time.monotonic(), torch.device(device), Worker.this()
     with worker.joined(device):
@@ -193,14 +192,9 @@ class _Run:
         """Read the newest whole checkpoint back.
 
         Raises:
-            InputError: There is none, or it has learned from or is judged by other panoramas.
+            InputError: There is none.
         """
         held = checkpoints_of(out).load(log.warning).state
-        for name in ("panoramas", "validation_panoramas"):
-            was, now = (set(r.get(name, ())) for r in (held.get("record", {}), record))
-            if was != now:
-                what = f"a training with other {name} ({', '.join(sorted(was ^ now))})"
-                raise InputError(out, what, "give the same again, or choose another --out")
         config = RegressorConfig(**plain_sizes(held["config"]))
         run = cls(out, RegressorModule(config), settings, device, record)
         run.network.load_state_dict(held["weights"])
