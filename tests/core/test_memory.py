@@ -7,9 +7,11 @@ network's batch is: libraries sum in another order then.
 import errno
 import json
 import resource
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -127,6 +129,20 @@ def test_shortages_are_known(fail: Callable[[], None]) -> None:
 def test_other_errors_are_no_shortage(error: Exception) -> None:
     assert not is_shortage(error)
     assert is_shortage(OSError(errno.ENOMEM, "Cannot allocate memory"))
+
+
+def test_other_cards_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Warp makes a context on whatever card is to be waited for, or fails where it may not."""
+    used, other = (SimpleNamespace(has_context=has) for has in (True, False))
+    waited: list[SimpleNamespace] = []
+    fake = SimpleNamespace(
+        is_cuda_available=lambda: True,
+        get_cuda_devices=lambda: [other, used],
+        synchronize_device=waited.append,
+    )
+    monkeypatch.setitem(sys.modules, "warp", fake)
+    memory_module.release()
+    assert waited == [used]
 
 
 # -------------------------------------------------------------------- the second attempt

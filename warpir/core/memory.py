@@ -269,8 +269,10 @@ def release() -> None:
     gc.collect()
     torch, warp = sys.modules.get("torch"), sys.modules.get("warp")
     if warp is not None and warp.is_cuda_available():
+        # Only cards that were used: to ask another one would make a context there, or fail.
         for device in warp.get_cuda_devices():
-            warp.synchronize_device(device)
+            if device.has_context:
+                warp.synchronize_device(device)
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.empty_cache()
 
