@@ -258,7 +258,7 @@ class RecordedStep:
         stream = self._graphs.stream
         if self._graph is None and self._calls <= PLAIN_STEPS:
             # Gradients remember the stream they were first made in.
-            current = torch.cuda.current_stream()
+            current = torch.cuda.current_stream(self._graphs.device)
             stream.wait_stream(current)
             with torch.cuda.stream(stream):
                 self._update()

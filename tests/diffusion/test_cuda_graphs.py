@@ -4,6 +4,7 @@ The plain functions are the reference. What cannot run without a CUDA device is 
 stays what makes a recording possible at all.
 """
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -405,6 +406,27 @@ def test_a_recorded_step_takes_one_step_a_call(folder: Path) -> None:
             held = next(iter(training.optimizer.state.values()))
             assert float(held["step"]) == step + 1
     assert lora_parameters(prior, "scene") == {}
+
+
+def test_first_steps_wait_for_their_own_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was uploaded is in that card's stream, whichever card is torch's current one."""
+    order: list[str] = []
+
+    class Stream:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def wait_stream(self, other: "Stream") -> None:
+            order.append(f"{self.name} after {other.name}")
+
+    def current(device: torch.device | None = None) -> Stream:
+        return Stream("cuda:0" if device is None else str(device))
+
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: Stream("own"))
+    monkeypatch.setattr(torch.cuda, "current_stream", current)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+    Graphs(torch.device("cuda:1")).recorded_step(lambda: order.append("update"))()
+    assert order == ["own after cuda:1", "update", "cuda:1 after own"]
 
 
 # The loop over lights
