@@ -17,6 +17,12 @@ def find_bin(x: float, curve: int, knot_x: wp.array2d[float], bin_count: int) ->
     return b
 
 
+@wp.func_grad(find_bin)
+def adj_find_bin(x: float, curve: int, knot_x: wp.array2d[float], bin_count: int, adj_ret: int):
+    """Do nothing: a bin's number has no slope, and nothing need be added to the knots."""
+    pass
+
+
 @wp.func
 def tone_curve(
     x: float,

@@ -1,6 +1,7 @@
 """The same bytes for the same seed: threads, kinds of processors, the clock, a GPU on request."""
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from warpir.render.determinism import (
     LARGE_PARAMETERS,
     LARGE_THREADS,
     THREADS,
+    _order_kernels,
     fixed_arithmetic,
     use_threads_for,
 )
@@ -247,7 +249,7 @@ def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
     if not wp._src.context.runtime.nvrtc_supported_archs:
         pytest.skip("Warp has no CUDA compiler here")
     for module in (composite, light_gradient, shade):
-        before = wp.get_module_options(module)
+        before = dict(wp.get_module_options(module))
         wp.set_module_options(
             {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": 16},
             module,
@@ -259,3 +261,26 @@ def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
         finally:
             names = ("deterministic", "deterministic_max_records")
             wp.set_module_options({name: before[name] for name in names}, module)
+
+
+@pytest.mark.case("R13")
+def test_only_additions_in_loops_need_room_to_spare() -> None:
+    """Warp counts those outside of loops itself; more room than they need is some gigabytes."""
+    import tempfile
+
+    from warpir.kernels import composite, light_gradient, shade
+
+    if not wp._src.context.runtime.nvrtc_supported_archs:
+        pytest.skip("Warp has no CUDA compiler here")
+    names = ("deterministic", "deterministic_max_records")
+    _order_kernels(is_deterministic=True)
+    try:
+        for module in (composite, light_gradient, shade):
+            with tempfile.TemporaryDirectory() as out:
+                wp.compile_aot_module(module, arch=80, module_dir=out, use_ptx=True)
+                source = next(Path(out).glob("*.cu")).read_text()
+            loops = re.findall(r"start_for_(\d+):;(.*?)end_for_\1:;", source, re.DOTALL)
+            has_loop = any("WP_DET_SCATTER" in body for _, body in loops)
+            assert has_loop == (wp.get_module_options(module)[names[1]] > 0)
+    finally:
+        _order_kernels(is_deterministic=False)

@@ -28,7 +28,8 @@ than with as many threads as cores."""
 LARGE_PARAMETERS = 10**8
 """Number of parameters from which a network counts as large."""
 MAX_RECORDS = 1024
-"""Largest number of ordered additions of one thread in a Warp kernel."""
+"""Largest number of ordered additions of one thread of `warpir.kernels.light_gradient`, whose loop
+Warp cannot count; it keeps room for as many of each thread."""
 WORKSPACE = ":4096:8"
 """Workspace of cuBLAS with which its results are reproducible, by NVIDIA's documentation."""
 
@@ -99,7 +100,7 @@ def _order_kernels(is_deterministic: bool) -> None:
     # `warpir.render.transport.rows` each get a row of their own instead.
     for module in (composite, light_gradient, shade):
         if wp.get_module_options(module)["deterministic"] != mode:
-            records = MAX_RECORDS if is_deterministic else 0
+            records = MAX_RECORDS if is_deterministic and module is light_gradient else 0
             wp.set_module_options(
                 {"deterministic": mode, "deterministic_max_records": records}, module
             )
