@@ -263,7 +263,6 @@ def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
             wp.set_module_options({name: before[name] for name in names}, module)
 
 
-@pytest.mark.case("R13")
 def test_only_additions_in_loops_need_room_to_spare() -> None:
     """Warp counts those outside of loops itself; more room than they need is some gigabytes."""
     import tempfile
