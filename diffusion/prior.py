@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+from warpir.core.errors import ExitCode, InputError
+
 T = TypeVar("T")
 
 
@@ -54,5 +56,9 @@ class BadSteps:
         return self.bad_steps >= BAD_STEPS_MAX
 
 
-class NonFiniteError(Exception):
+class NonFiniteError(InputError):
     """Numbers stayed non-finite; the program says so and exits with 6."""
+
+    def __init__(self, what: str) -> None:
+        advice = "try --precision fp32; the last checkpoint holds the state before"
+        super().__init__("guidance", what, advice, ExitCode.NUMERIC)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from warpir.app.program import run_program
-from warpir.core.errors import ExitCode, InputError
+from warpir.core.errors import ExitCode
 
 PHOTO_SIZE = (48, 36)
 """What cameras and masks belong to [px]."""
@@ -150,14 +150,9 @@ def _regressor(path: Path) -> None:
 
 
 def _lora(path: Path) -> None:
-    from warpir.diffusion.models.model_error import ModelError
     from warpir.diffusion.personalization.lora_files import read_lora
 
-    try:
-        read_lora(path)
-    except ModelError as error:
-        # What the program makes of it (`warpir.optimize.model`).
-        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from error
+    read_lora(path)
 
 
 def _checkpoint(path: Path) -> None:

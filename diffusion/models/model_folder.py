@@ -189,6 +189,8 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         _check_pointer(path)
         return read_json_object(path)
+    except ModelError:
+        raise
     except (InputError, OSError) as error:
         reason = error.what if isinstance(error, InputError) else error.strerror
         raise ModelError(path, f"not JSON ({reason})", "fetch the model again") from error

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from warpir.app.config import InsertConfig
-from warpir.core.errors import ExitCode, InputError, raise_all
+from warpir.core.errors import InputError, raise_all
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.settings import ModelSettings
 
@@ -34,7 +34,7 @@ def require_model(config: InsertConfig) -> None:
         try:
             return check()
         except ModelError as error:
-            problems.append(InputError(error.where, error.what, error.advice, ExitCode.MODEL))
+            problems.append(error)
             return None
 
     lora = None if config.adapter.lora is None else Path(config.adapter.lora)

@@ -17,7 +17,6 @@ from warpir.core import signals
 from warpir.core.atomic import WriteError
 from warpir.core.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_error
 from warpir.core.memory import MIB, free_host, is_shortage
-from warpir.diffusion.models.model_error import ModelError
 
 _LOG = logging.getLogger(__name__)
 INTERRUPTED = 130
@@ -229,8 +228,6 @@ def explain(error: BaseException) -> tuple[int, list[str]]:
         )
     elif isinstance(error, WriteError) or (isinstance(error, OSError) and error.errno in DISK_FULL):
         error = disk_error(error.filename or "--out or the folder of temporary files", error)
-    elif isinstance(error, ModelError):
-        error = InputError(error.where, error.what, error.advice, ExitCode.MODEL)
     if isinstance(error, InputError):
         lines = [_one_line(f"error: {error.where}: {error.what}")]
         lines += [_one_line(error.advice)] if error.advice else []

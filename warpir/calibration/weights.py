@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
-from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.weight_files import WeightFile
 
@@ -51,13 +50,10 @@ def read_weights(
     Raises:
         InputError: The file is absent, damaged or of another kind (`ExitCode.MODEL`).
     """
-    try:
-        file = check(path)
-        sizes = json.loads(file.about["config"])
-        if shapes(sizes) != file.shapes:
-            what = "damaged (the weights are not those of its network)"
-            raise ModelError(str(file.path), what)
-        values = load_file(file.path)
-    except ModelError as error:
-        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
+    file = check(path)
+    sizes = json.loads(file.about["config"])
+    if shapes(sizes) != file.shapes:
+        what = "damaged (the weights are not those of its network)"
+        raise ModelError(file.path, what)
+    values = load_file(file.path)
     return Weights(sizes, values, json.loads(file.about["record"]))

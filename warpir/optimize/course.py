@@ -20,7 +20,6 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalization.lora_files import save_lora
-from warpir.diffusion.prior import NonFiniteError
 from warpir.io.images.resize import resize
 from warpir.io.unfinished import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
@@ -229,9 +228,9 @@ def follow(
     with run.timings.stage("optimize"), signals.deferred():
         try:
             loop.run(on_step)
-        except (InputError, NonFiniteError) as error:
+        except InputError as error:
             # The step that failed changed nothing: this is the last good state.
-            if not isinstance(error, InputError) or error.code == ExitCode.NUMERIC:
+            if error.code == ExitCode.NUMERIC:
                 save()
             raise
     if loop.state.best_score is not None:

@@ -30,7 +30,7 @@ from warpir.optimize.course import (
     open_checkpoints,
 )
 from warpir.optimize.loop import Composite, Guide, Optimization
-from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
+from warpir.optimize.model import make_guide, prepare_guidance
 from warpir.optimize.view import LitFrame
 from warpir.render.bridge import ShadeForeground
 from warpir.render.integrator import MaterialTensors
@@ -329,22 +329,21 @@ def refine(run: Run, light: SceneLight) -> Outcome:
     """
     run = replace(run, config=run.config.settled())
     asset = run.inputs.asset
-    with as_input_errors():
-        checkpoints = open_checkpoints(run)
-        with run.timings.stage("scene"):
-            # Curves of an earlier run belong to its tone operator.
-            frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
-        guided = prepare_guidance(run, checkpoints)
-        with run.timings.stage("trace"):
-            release()
-            guide = make_guide(run, guided, frame)
-            lit = LitFrame(frame, light, torch.device(run.device))
-        loop = _loop_of(run, lit, light.curves, guide)
-        moves = what_moves(run.config.task, asset)
-        run.log.say(f"free: {', '.join(moves['free'])}; frozen: {', '.join(moves['frozen'])}")
-        course = follow(run, loop, guided, guide, frame.renderer)
-        with run.timings.stage("write"):
-            course.write()
+    checkpoints = open_checkpoints(run)
+    with run.timings.stage("scene"):
+        # Curves of an earlier run belong to its tone operator.
+        frame = replace(make_frame(run), is_reinhard=light.curves.tone == "reinhard")
+    guided = prepare_guidance(run, checkpoints)
+    with run.timings.stage("trace"):
+        release()
+        guide = make_guide(run, guided, frame)
+        lit = LitFrame(frame, light, torch.device(run.device))
+    loop = _loop_of(run, lit, light.curves, guide)
+    moves = what_moves(run.config.task, asset)
+    run.log.say(f"free: {', '.join(moves['free'])}; frozen: {', '.join(moves['frozen'])}")
+    course = follow(run, loop, guided, guide, frame.renderer)
+    with run.timings.stage("write"):
+        course.write()
     notices = tuple(course.notices())
     if isinstance(loop, ToneRefinement):
         fitted = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))

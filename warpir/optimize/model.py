@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,13 +13,11 @@ from warpir.core import signals
 from warpir.core.atomic import Checkpoint, Checkpoints
 from warpir.core.cache import cache_folder
 from warpir.core.color import linear_to_gamma
-from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import needs_of_model
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance, kind_of
 from warpir.diffusion.models.hub import find_model, hub_offline
 from warpir.diffusion.models.loading import load_stable_diffusion
-from warpir.diffusion.models.model_error import ModelError
 from warpir.diffusion.models.model_folder import check_model_folder
 from warpir.diffusion.models.stable_diffusion import StableDiffusion
 from warpir.diffusion.personalization.personalize import (
@@ -30,7 +26,6 @@ from warpir.diffusion.personalization.personalize import (
     restore_personalization,
 )
 from warpir.diffusion.personalization.show_prior import show_personalization
-from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.optimize.checkpoint import is_due
 from warpir.optimize.view import Frame
@@ -234,15 +229,3 @@ def make_guide(run: Run, guided: Guided, frame: Frame) -> Guidance | DatasetUpda
         shown = linear_to_gamma(frame.photo_lin).astype(np.float32)
         guide.ensure_precision(torch.from_numpy(shown).permute(2, 0, 1)[None].to(run.device))
     return guide
-
-
-@contextmanager
-def as_input_errors() -> Iterator[None]:
-    """Turn the model's errors into the program's."""
-    try:
-        yield
-    except ModelError as error:
-        raise InputError(error.where, error.what, error.advice, ExitCode.MODEL) from None
-    except NonFiniteError as error:
-        advice = "try --precision fp32; the last checkpoint holds the state before"
-        raise InputError("guidance", str(error), advice, ExitCode.NUMERIC) from None

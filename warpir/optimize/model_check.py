@@ -36,7 +36,6 @@ from warpir.diffusion.personalization.personalize import personalize
 from warpir.diffusion.prior import NonFiniteError
 from warpir.diffusion.prompts import Prompts, make_prompts
 from warpir.diffusion.settings import GuidanceSettings, PersonalizeSettings
-from warpir.optimize.model import as_input_errors
 from warpir.render.device import choose_device
 
 PROMPT = "a small red car"
@@ -119,9 +118,8 @@ def load_and_check(
         InputError: The model cannot be used, or there is no such device.
     """
     device = torch.device(choose_device(config.render.device))
-    with as_input_errors():
-        prior = load_stable_diffusion(config.diffusion, device)
-        report = check_model(prior, photo, config, say)
+    prior = load_stable_diffusion(config.diffusion, device)
+    report = check_model(prior, photo, config, say)
     for notice in prior.notices:
         say(f"notice: {notice}")
     return report

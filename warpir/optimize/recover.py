@@ -34,7 +34,7 @@ from warpir.optimize.course import (
     write_start,
 )
 from warpir.optimize.light import LightOptimization, Unknowns
-from warpir.optimize.model import as_input_errors, make_guide, prepare_guidance
+from warpir.optimize.model import make_guide, prepare_guidance
 from warpir.scene.light import Lobes, as_map, summarize
 from warpir.scene.tone_curves import Curves
 
@@ -73,36 +73,35 @@ def recover(run: Run, given: SceneLight | None, regression: Regression | None = 
     """
     settings = run.config.optimize
     start = Start(given) if given is not None else _estimated(run, regression)
-    with as_input_errors():
-        checkpoints = open_checkpoints(run)
-        with run.timings.stage("scene"):
-            frame = make_frame(run)
-            unknowns = unknowns_of(run, start).to(run.device)
-            region = region_of(start, unknowns)
-        if settings.preview_every:
-            with run.timings.stage("preview"):
-                write_start(run, frame, start.light)
-        guided = prepare_guidance(run, checkpoints)
-        with run.timings.stage("trace"):
-            release()
-            guide = make_guide(run, guided, frame)
-            graphs = guided.prior.graphs
-            record = graphs.recorded_module if graphs else None
-            cache = cache_folder("transport")
-            loop = LightOptimization(
-                frame, guide, settings, unknowns, cache, record=record, region=region
-            )
-        before = _state_of(unknowns)
-        course = follow(run, loop, guided, guide, frame.renderer)
-        judged = None
-        if run.config.guidance.accept:
-            assert isinstance(guide, Guidance)
-            with run.timings.stage("accept"):
-                judged = judge_end(loop, guide, before)
-            run.log.say(judged.verdict.line)
-        with run.timings.stage("write"):
-            light = delivered(run, loop, start)
-            course.write()
+    checkpoints = open_checkpoints(run)
+    with run.timings.stage("scene"):
+        frame = make_frame(run)
+        unknowns = unknowns_of(run, start).to(run.device)
+        region = region_of(start, unknowns)
+    if settings.preview_every:
+        with run.timings.stage("preview"):
+            write_start(run, frame, start.light)
+    guided = prepare_guidance(run, checkpoints)
+    with run.timings.stage("trace"):
+        release()
+        guide = make_guide(run, guided, frame)
+        graphs = guided.prior.graphs
+        record = graphs.recorded_module if graphs else None
+        cache = cache_folder("transport")
+        loop = LightOptimization(
+            frame, guide, settings, unknowns, cache, record=record, region=region
+        )
+    before = _state_of(unknowns)
+    course = follow(run, loop, guided, guide, frame.renderer)
+    judged = None
+    if run.config.guidance.accept:
+        assert isinstance(guide, Guidance)
+        with run.timings.stage("accept"):
+            judged = judge_end(loop, guide, before)
+        run.log.say(judged.verdict.line)
+    with run.timings.stage("write"):
+        light = delivered(run, loop, start)
+        course.write()
     measured = course.record(settings.integrator) | _measured(start, light, judged)
     notices = tuple(course.notices())
     if judged is not None and not judged.verdict.is_accepted:
