@@ -155,8 +155,7 @@ def reference(
     constants = ComposeConstants(
         frame.photo_lin, objects, proxies, mask, str(renderer.device.alias), frame.is_reinhard
     )
-    planes = radiance.foreground, radiance.lit, radiance.unoccluded
-    return compose(constants, *planes, curve_fg, curve_shadow)
+    return compose(constants, radiance, curve_fg, curve_shadow)
 
 
 class TowardTruth:

@@ -87,9 +87,7 @@ class Pipeline:
         for name, curve in (("fg", self.curve_fg), ("shadow", self.curve_shadow)):
             parts = {part: raw[f"curve_{name}_{part}"] for part in ("widths", "heights", "slopes")}
             knots.append(functional_call(curve, parts, ()))
-        image = compose(
-            self.constants, radiance.foreground, radiance.lit, radiance.unoccluded, *knots
-        )
+        image = compose(self.constants, radiance, *knots)
         return ((image.double() - self.target) ** 2).sum()
 
     def free(self, raw: dict[str, Tensor]) -> Tensor:

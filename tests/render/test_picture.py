@@ -23,6 +23,7 @@ from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.composite import Picture, make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
+from warpir.render.integrator import Radiance
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
@@ -81,7 +82,7 @@ def bent_knots(curves: int, seed: int) -> ToneKnots:
     with torch.no_grad():
         for values in curve.parameters():
             values.copy_(0.7 * torch.randn(values.shape, generator=generator))
-    return ToneKnots(*curve.arrays())
+    return curve.plain()
 
 
 def tensors(knots: ToneKnots) -> Knots:
@@ -121,7 +122,7 @@ def test_picture_equals_the_differentiable_composite(
     constants = ComposeConstants(photo().linear(), objects, shaded, out.mask, device, is_reinhard)
     image = compose(
         constants,
-        *(torch.from_numpy(x) for x in (out.radiance, ratio, np.ones_like(ratio))),
+        Radiance(*(torch.from_numpy(x) for x in (out.radiance, ratio, np.ones_like(ratio)))),
         *(tensors(k) for k in (curves.foreground, curves.shadow_ratio)),
     )
     found = image[0].permute(1, 2, 0).numpy()

@@ -27,6 +27,7 @@ from warpir.lighting.regressor import Regressor, load_regressor
 from warpir.render.bridge import ComposeConstants, compose
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
+from warpir.render.integrator import Radiance
 from warpir.render.picture.planes import spread
 from warpir.render.picture.quality import Quality
 from warpir.render.picture.tone import tone_mapped
@@ -34,7 +35,7 @@ from warpir.render.renderer import Foreground, Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import ToneCurve
 from warpir.scene.light import Light
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 from warpir.train.networks.regressor import random_regressor
 from warpir.train.places import learned_from, without_size
 
@@ -204,7 +205,7 @@ class Stage:
             str(self.renderer.device.alias),
             True,
         )
-        radiance, white = torch.from_numpy(foreground.radiance), torch.ones_like(ratio)
+        radiance = Radiance(torch.from_numpy(foreground.radiance), ratio, torch.ones_like(ratio))
         truth = torch.from_numpy(self.truth).permute(2, 0, 1)[None]
         curve_fg, curve_shadow = ToneCurve(1), ToneCurve(3)
         optimizer = torch.optim.LBFGS(
@@ -216,13 +217,13 @@ class Stage:
 
         def error() -> float:
             optimizer.zero_grad()
-            image = compose(constants, radiance, ratio, white, curve_fg(), curve_shadow())
+            image = compose(constants, radiance, curve_fg(), curve_shadow())
             squared = (image - truth).square().sum()
             squared.backward()
             return float(squared.detach())
 
         optimizer.step(error)
-        return Curves("reinhard", ToneKnots(*curve_fg.arrays()), ToneKnots(*curve_shadow.arrays()))
+        return Curves("reinhard", curve_fg.plain(), curve_shadow.plain())
 
 
 def _encoded(linear: FloatArray) -> FloatArray:

@@ -30,7 +30,7 @@ from warpir.optimize.view import Frame, LitFrame
 from warpir.render.picture.photo_scene import scene_of
 from warpir.render.renderer import Renderer
 from warpir.render.tone_curve import ToneCurve
-from warpir.scene.tone_curves import Curves, ToneKnots
+from warpir.scene.tone_curves import Curves
 
 SAY_EVERY = 25
 """Steps between two progress lines that describe the unknowns."""
@@ -270,8 +270,3 @@ def write_preview(run: Run, image: torch.Tensor, step: int) -> None:
     shown = image[0].permute(1, 2, 0).cpu().numpy()
     path = run.output.write_preview(step, np.round(shown * 255.0).astype(np.uint8))
     run.log.say(f"preview: {path}")
-
-
-def knots_of(curve: ToneCurve) -> ToneKnots:
-    """Return a curve as plain arrays."""
-    return ToneKnots(*curve.arrays())

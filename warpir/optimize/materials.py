@@ -25,7 +25,6 @@ from warpir.lighting.scene_light import SceneLight
 from warpir.optimize.course import (
     Outcome,
     follow,
-    knots_of,
     make_frame,
     open_checkpoints,
 )
@@ -177,8 +176,8 @@ class ToneUnknowns(torch.nn.Module):
 
     def __init__(self, curves: Curves) -> None:
         super().__init__()
-        self.curve_fg = ToneCurve.from_knots(*curves.foreground.arrays())
-        self.curve_shadow = ToneCurve.from_knots(*curves.shadow_ratio.arrays())
+        self.curve_fg = ToneCurve.from_knots(curves.foreground)
+        self.curve_shadow = ToneCurve.from_knots(curves.shadow_ratio)
 
 
 # ---------------------------------------------------------------------------------- loops
@@ -296,9 +295,9 @@ class ToneRefinement(Optimization):
 
     def describe(self, camera: Camera) -> str:
         """Return the mid tones after the curves, by linear interpolation between knots."""
-        fg, shadow = self.unknowns.curve_fg.arrays(), self.unknowns.curve_shadow.arrays()
-        shown = np.interp(0.5, fg[0][0], fg[1][0])
-        ratios = (f"{np.interp(0.5, x, y):.2f}" for x, y in zip(*shadow[:2], strict=True))
+        fg, shadow = self.unknowns.curve_fg.plain(), self.unknowns.curve_shadow.plain()
+        shown = np.interp(0.5, fg.x[0], fg.y[0])
+        ratios = (f"{np.interp(0.5, x, y):.2f}" for x, y in zip(shadow.x, shadow.y, strict=True))
         return f"mid tone 0.5 becomes {shown:.2f}, of the shadow {' '.join(ratios)}"
 
 
@@ -346,7 +345,7 @@ def refine(run: Run, light: SceneLight) -> Outcome:
         course.write()
     notices = tuple(course.notices())
     if isinstance(loop, ToneRefinement):
-        fitted = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
+        fitted = loop.unknowns.curve_fg.plain(), loop.unknowns.curve_shadow.plain()
         light = replace(light, curves=Curves(light.curves.tone, *fitted))
     else:
         refined = loop.unknowns.materials()

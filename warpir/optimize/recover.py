@@ -28,7 +28,6 @@ from warpir.optimize.acceptance import Verdict, blend, judge
 from warpir.optimize.course import (
     Outcome,
     follow,
-    knots_of,
     make_frame,
     open_checkpoints,
     write_start,
@@ -160,7 +159,7 @@ def widened(lobes: Lobes, sigma_min: float) -> Lobes:
 def delivered(run: Run, loop: LightOptimization, start: Start) -> SceneLight:
     """Return light and curves at the loop's end."""
     light_fg, light_shadow = loop.final_lights(LIGHT_HEIGHT)
-    fitted = (knots_of(c) for c in (loop.unknowns.curve_fg, loop.unknowns.curve_shadow))
+    fitted = loop.unknowns.curve_fg.plain(), loop.unknowns.curve_shadow.plain()
     curves = Curves(run.config.tone_operator, *fitted)
     return SceneLight(light_fg, light_shadow, curves, 0.0, start.light.assumed)
 

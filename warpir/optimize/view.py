@@ -128,14 +128,7 @@ class View:
 
     def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
-        return compose(
-            self.constants,
-            radiance.foreground,
-            radiance.lit,
-            radiance.unoccluded,
-            curve_fg,
-            curve_shadow,
-        )
+        return compose(self.constants, radiance, curve_fg, curve_shadow)
 
     def staleness(self, texels_fg: Tensor, texels_shadow: Tensor) -> float:
         """Return the traced rows' noise under this light over that under the expected one [1]."""
@@ -212,6 +205,5 @@ class LitFrame:
 
     def image(self, foreground: Tensor, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
         """Return the composite, display-encoded, shape [1, 3, H, W]; differentiable."""
-        return compose(
-            self.constants, foreground, self.lit, self.unoccluded, curve_fg, curve_shadow
-        )
+        radiance = Radiance(foreground, self.lit, self.unoccluded)
+        return compose(self.constants, radiance, curve_fg, curve_shadow)

@@ -6,6 +6,7 @@ Tensors are detached before Warp sees them and gradients are read from arrays of
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels import composite as composite_kernels
 from warpir.kernels.shadow_ratio import shadow_ratio as ratio_kernel
 from warpir.kernels.types import LightArgs
+from warpir.render.integrator import Radiance
 from warpir.render.mis.samples import Gradients, ObjectSamples, ReceiverSamples
 from warpir.render.renderer import index_of
 from warpir.render.tone_curve import Knots
@@ -135,6 +137,7 @@ class _Compose(torch.autograd.Function):
         knots = [
             _from_torch(t.repeat(copies, 1), wp.float32, device, grad=True) for t in tensors[3:]
         ]
+        bins_fg, bins_shadow = (t.shape[1] - 1 for t in (tensors[3], tensors[6]))
         objects, shaded = len(tensors[0]), len(tensors[1])
         pixels = constants.height * constants.width
         ratio, fg_display, ratio_display, image = (
@@ -153,13 +156,13 @@ class _Compose(torch.autograd.Function):
             launch(
                 composite_kernels.tone_foreground,
                 objects,
-                [*of_object, *knots[:3], constants.bins_fg],
+                [*of_object, *knots[:3], bins_fg],
                 fg_display,
             )
             launch(
                 composite_kernels.tone_shadow,
                 shaded,
-                [ratio, *knots[3:], constants.bins_shadow],
+                [ratio, *knots[3:], bins_shadow],
                 ratio_display,
             )
             launch(
@@ -199,10 +202,10 @@ class ComposeConstants:
 
     def __init__(
         self,
-        photo_lin: np.ndarray[Any, np.dtype[np.float32]],
+        photo_lin: FloatArray,
         object_pixels: IntArray,
         receiver_pixels: IntArray,
-        mask: np.ndarray[Any, np.dtype[np.float32]],
+        mask: FloatArray,
         device: str,
         is_reinhard: bool = True,
     ) -> None:
@@ -221,41 +224,22 @@ class ComposeConstants:
             mask if len(mask) else np.zeros(1, np.float32), dtype=wp.float32, device=self.device
         )
         self.is_reinhard = int(is_reinhard)
-        self.bins_fg = self.bins_shadow = 5
 
 
 def compose(
-    constants: ComposeConstants,
-    foreground: Tensor,
-    lit: Tensor,
-    unoccluded: Tensor,
-    curve_fg: Knots,
-    curve_shadow: Knots,
+    constants: ComposeConstants, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots
 ) -> Tensor:
     """Shadow ratio, tone curves, composite and encoding (DiPIR, eq. 5 and 6); differentiable.
 
     Args:
         constants: Photo, pixel lists and coverage.
-        foreground: Object radiance, premultiplied, shape [object_pixel, 3].
-        lit: White plane with the object, shape [receiver_pixel, 3].
-        unoccluded: White plane without it, shape [receiver_pixel, 3].
+        radiance: Of object and receiver.
         curve_fg: One curve.
         curve_shadow: Three curves.
 
     Returns:
         The composite, display-encoded, shape [1, 3, H, W].
     """
-    constants.bins_fg, constants.bins_shadow = curve_fg.bin_count, curve_shadow.bin_count
-    out: Tensor = _Compose.apply(
-        constants,
-        foreground,
-        lit,
-        unoccluded,
-        curve_fg.x,
-        curve_fg.y,
-        curve_fg.slope,
-        curve_shadow.x,
-        curve_shadow.y,
-        curve_shadow.slope,
-    )
+    parts = (vars(group).values() for group in (radiance, curve_fg, curve_shadow))
+    out: Tensor = _Compose.apply(constants, *chain.from_iterable(parts))
     return out

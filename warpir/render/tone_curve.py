@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from warpir.core.arrays import FloatArray
+from warpir.scene.tone_curves import ToneKnots
 
 MIN_BIN = 1e-3
 """Least width, height and slope of a bin [1]."""
@@ -29,11 +30,6 @@ class Knots:
     x: Tensor
     y: Tensor
     slope: Tensor
-
-    @property
-    def bin_count(self) -> int:
-        """Number of bins of each curve."""
-        return int(self.x.shape[1]) - 1
 
 
 def _edges(raw: Tensor) -> Tensor:
@@ -72,16 +68,16 @@ class ToneCurve(torch.nn.Module):
         self.slopes = torch.nn.Parameter(torch.zeros(curves, bins + 1))
 
     @staticmethod
-    def from_knots(x: FloatArray, y: FloatArray, slope: FloatArray) -> ToneCurve:
-        """Return curves that start at given knots, shape [curve, bin + 1] each.
+    def from_knots(knots: ToneKnots) -> ToneCurve:
+        """Return curves that start at given knots.
 
         Bins and slopes below `MIN_BIN`, which no parameters mean, are raised to it.
         """
-        curve = ToneCurve(x.shape[0], x.shape[1] - 1)
+        curve = ToneCurve(len(knots.x), knots.bin_count)
         with torch.no_grad():
-            curve.widths.copy_(_raw_bins(x))
-            curve.heights.copy_(_raw_bins(y))
-            above = torch.from_numpy(slope.astype(np.float64) - MIN_BIN).clamp(min=LEAST)
+            curve.widths.copy_(_raw_bins(knots.x))
+            curve.heights.copy_(_raw_bins(knots.y))
+            above = torch.from_numpy(knots.slope.astype(np.float64) - MIN_BIN).clamp(min=LEAST)
             curve.slopes.copy_(above + torch.log(-torch.expm1(-BETA * above)) / BETA)
         return curve
 
@@ -90,8 +86,7 @@ class ToneCurve(torch.nn.Module):
         slope = MIN_BIN + torch.nn.functional.softplus(self.slopes, beta=BETA)
         return Knots(_edges(self.widths), _edges(self.heights), slope)
 
-    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the knots as plain arrays x, y, slope, for files and the final render."""
+    def plain(self) -> ToneKnots:
+        """Return the knots as plain arrays, for files and the final render."""
         with torch.no_grad():
-            knots = self.forward()
-        return knots.x.cpu().numpy(), knots.y.cpu().numpy(), knots.slope.cpu().numpy()
+            return ToneKnots(*(part.cpu().numpy() for part in vars(self.forward()).values()))
