@@ -145,7 +145,7 @@ def truth_of(asset: Asset, part: str = "roughness") -> Tensor:
 def test_between_starts_exactly_and_keeps_its_bounds(low: float) -> None:
     """Starts at 0 and 1 have finite raw values that still move; steps of any size end inside."""
     start = torch.tensor([0.0, 1e-4, low, 0.3, 0.5, 1.0 / 3.0, 0.999, 1.0])
-    values = Between(start, low, 1.0)
+    values = Between(start, low)
     assert torch.equal(values(), start.clamp(min=low))
     assert values.raw.isfinite().all()
     (slope,) = torch.autograd.grad(values().sum(), values.raw)

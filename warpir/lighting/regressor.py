@@ -250,18 +250,14 @@ def mean_luminance(photo: AnyFloatArray) -> float:
 
 
 def least_angle(
-    directions: Float64Array, probability: Float64Array, steps: int = 20
+    directions: Float64Array, probability: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return the directions of least expected angle, shape [B, 3], and that angle [rad], [B].
 
     The geometric median: the best candidate, refined by Weiszfeld's steps on the sphere. A
     candidate stands for its cell, so angles are smoothed by half the spacing; without that every
-    step would fall back on a candidate.
-
-    Args:
-        directions: Unit candidates, shape [K, 3].
-        probability: Of each, rows sum to 1, shape [B, K].
-        steps: Of the refinement.
+    step would fall back on a candidate. Candidates are unit, shape [K, 3]; rows of their
+    probabilities, shape [B, K], sum to 1.
     """
 
     def angles(axes: Float64Array) -> Float64Array:
@@ -271,7 +267,7 @@ def least_angle(
     axis = directions[(probability @ angles(directions).T).argmin(axis=1)]
     # Of about K / (solid angle share of the candidates) cells on the whole sphere.
     half_spacing = 0.5 * math.sqrt(4.0 * math.pi * (1.0 - LOWEST) / 2.0 / len(directions))
-    for _ in range(steps):
+    for _ in range(20):
         angle = angles(axis)
         pull = probability / np.sqrt(angle**2 + half_spacing**2)
         # log map: the tangent toward a candidate, as long as the angle.

@@ -55,20 +55,17 @@ GROUND_IS_DARK = "what the object emits does not light the ground"
 
 
 class Between(torch.nn.Module):
-    """Values between two bounds, both within reach: a sigmoid that is stretched by `MARGIN`.
+    """Values from a lower bound to 1, both within reach: a sigmoid that is stretched by `MARGIN`.
 
-    Args:
-        start: Any shape; brought into the bounds.
-        low: Lower bound.
-        high: Upper bound.
+    The start, of any shape, is brought into the bounds.
     """
 
     rounding: Tensor
 
-    def __init__(self, start: Tensor, low: float, high: float) -> None:
+    def __init__(self, start: Tensor, low: float) -> None:
         super().__init__()
-        self.low, self.span = low, high - low
-        start = start.clamp(low, high)
+        self.low, self.span = low, 1.0 - low
+        start = start.clamp(low, 1.0)
         share = (start.double() - low) / self.span
         raw = torch.logit((share + MARGIN) / (1.0 + 2.0 * MARGIN))
         self.raw = torch.nn.Parameter(raw.float())
@@ -130,7 +127,7 @@ class Factors(torch.nn.Module):
             self.parts[part] = (
                 Positive(start.clamp(min=EMISSION_START))
                 if part == "emission"
-                else Between(start, LOWEST[part], 1.0)
+                else Between(start, LOWEST[part])
             )
 
     def forward(self) -> MaterialTensors:

@@ -60,6 +60,14 @@ class Rows:
         return part
 
 
+def copied(struct: Any) -> Any:
+    """Return a struct of the same arrays and numbers."""
+    copy = type(struct)()
+    for name in struct._cls.vars:
+        setattr(copy, name, getattr(struct, name))
+    return copy
+
+
 def start_warp() -> None:
     """Start Warp once, with a kernel cache that is writable and valid."""
     # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.

@@ -9,7 +9,6 @@ sun 1e-4 with `SIDE`, of 32 lobes 1e-3, and a third of either with `FINE_SIDE`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,7 +19,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, texel_solid_angles
 from warpir.kernels.sampling import draw_light, sum_plane
 from warpir.kernels.types import DrawnLight, LampArgs, LightArgs
-from warpir.render.device import Launcher, Rows
+from warpir.render.device import Launcher, Rows, copied
 from warpir.scene.light import Light, Lobes
 from warpir.scene.near.lamps import Lamp, RectangleLamp
 
@@ -144,10 +143,7 @@ def drawn(
         normal: Unit normal of the one plane that is lit, shape [3]: directions are drawn from the
             light times the cosine then. None: from the light.
     """
-    out = LightArgs()
-    struct: Any = light
-    for name in struct._cls.vars:
-        setattr(out, name, getattr(light, name))
+    out: LightArgs = copied(light)
     if normal is not None:
         propose(out, normal)
     side = FINE_SIDE if samples >= FINE_FROM else SIDE

@@ -34,6 +34,18 @@ def directions_of_path(scene: Scene, depth: int) -> int:
     return 2 * depth + (GLASS_DEPTH + 1 if scene.has_solid_glass else 0)
 
 
+def variant_of(scene: Scene, materials: MaterialArgs, viewer: Viewer) -> tuple[int, ...]:
+    """Return the variant of `foreground_kernel` that a scene needs."""
+    return (
+        materials.any_layers,
+        bool(scene.receiver_args.mesh),
+        viewer,
+        bool(scene.lamps),
+        scene.has_solid_glass and viewer != Viewer.GROUND,
+        scene.has_passing,
+    )
+
+
 def geometry_of(
     renderer: Renderer, pixels: IntArray, spp: int, seed: int
 ) -> tuple[FloatArray, ...]:
@@ -136,14 +148,7 @@ class ObjectLaunch:
         viewer, alpha = Viewer.GROUND if is_from_ground else Viewer.CAMERA, 0.0
         if self.ground_roughness is not None:
             viewer, alpha = Viewer.MIRROR, self.ground_roughness**2
-        kernel = foreground_kernel(
-            self.materials.any_layers,
-            bool(scene.receiver_args.mesh),
-            viewer,
-            bool(scene.lamps),
-            scene.has_solid_glass and viewer != Viewer.GROUND,
-            scene.has_passing,
-        )
+        kernel = foreground_kernel(*variant_of(scene, self.materials, viewer))
         is_recorded = self.is_recorded or bool(light_record or vertex_record)
         hidden = None
         if may_see_object is not None:

@@ -25,7 +25,13 @@ from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels
 from warpir.render.device_light import drawn, plane_radiance
 from warpir.render.device_scene import Scene
-from warpir.render.launches import THROWN_LIMIT, ObjectLaunch, ReceiverLaunch, geometry_of
+from warpir.render.launches import (
+    THROWN_LIMIT,
+    ObjectLaunch,
+    ReceiverLaunch,
+    geometry_of,
+    variant_of,
+)
 from warpir.render.shadow.pilot import dilate
 from warpir.scene.camera import Camera
 from warpir.scene.placement import box_corners
@@ -126,21 +132,10 @@ class Renderer(Launcher):
         Args:
             mirrors: Whether the ground shows the object's mirror image.
         """
-        scene = self.scene
-        flags = scene.material_args.any_layers, bool(scene.receiver_args.mesh)
-        viewers = [Viewer.CAMERA]
+        scene, viewers = self.scene, [Viewer.CAMERA]
         viewers += [Viewer.GROUND] if self.bounce_depth else []
         viewers += [Viewer.MIRROR] if mirrors else []
-        variants = [
-            (
-                *flags,
-                viewer,
-                bool(scene.lamps),
-                scene.has_solid_glass and viewer != Viewer.GROUND,
-                scene.has_passing,
-            )
-            for viewer in viewers
-        ]
+        variants = [variant_of(scene, scene.material_args, viewer) for viewer in viewers]
         load_kernels(self.device, variants, self._progress)
 
     def candidate_pixels(self, camera: Camera) -> IntArray:

@@ -34,16 +34,13 @@ def sheen_albedo_table() -> Float64Array:
     return np.minimum(table, 1.0)
 
 
-def sheen_albedo(cosine: Float64Array, roughness: float, nodes: int = 64) -> Float64Array:
+def sheen_albedo(cosine: Float64Array, roughness: float) -> Float64Array:
     """Integrate the lobe times the cosine over all directions toward the light [1].
 
-    Args:
-        cosine: Cosines of the directions toward the camera, above 0, shape [angle].
-        roughness: Perceptual roughness [1].
-        nodes: Gauss-Legendre nodes in azimuth and in the cosine.
+    For cosines of directions toward the camera, above 0, shape [angle]; roughness is perceptual.
     """
     alpha = max(roughness**2, ALPHA_MIN)
-    x, weight = np.polynomial.legendre.leggauss(nodes)
+    x, weight = np.polynomial.legendre.leggauss(64)
     x, weight = 0.5 * (x + 1.0), 0.5 * weight
     # Both grazing angles and the mirror's azimuth are steep.
     cos_i, d_cos = x**4, 4.0 * x**3 * weight

@@ -12,23 +12,17 @@ from warpir.scene.light import Light, as_map
 
 GREY_BALL = 0.18
 """Reflectance of the matte ball in ``balls.png``."""
+SIZE = 192
+"""Height of that picture [px], which is twice as wide."""
 
 
-def balls(light: Light, camera: Camera, is_reinhard: bool, size: int = 192) -> CodeArray:
+def balls(light: Light, camera: Camera, is_reinhard: bool) -> CodeArray:
     """Return a mirror ball and a grey diffuse ball under the light, as the camera sees them.
 
-    As on a film set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.
-
-    Args:
-        light: At the photo's exposure.
-        camera: Gives the viewing direction.
-        is_reinhard: The tone operator of the picture.
-        size: Height of the preview [px]; it is twice as wide.
-
-    Returns:
-        Display codes, shape [size, 2 size, 3].
+    Display codes, shape [`SIZE`, 2 `SIZE`, 3], of a light at the photo's exposure. As on a film
+    set: `GREY_BALL` keeps the lit side of a sunny light below the photo's white.
     """
-    axis = (np.arange(size) + 0.5) / size * 2.0 - 1.0
+    axis = (np.arange(SIZE) + 0.5) / SIZE * 2.0 - 1.0
     x, y = np.meshgrid(axis * 1.06, -axis * 1.06)
     inside = x * x + y * y < 1.0
     z = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))

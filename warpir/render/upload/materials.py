@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
 
 import numpy as np
 import warp as wp
 
 from warpir.core.arrays import FloatArray
 from warpir.kernels.types import ANISOTROPY, IRIDESCENCE, LAYERS, Extensions, MaterialArgs
+from warpir.render.device import copied
 from warpir.scene.asset import Material, TextureSlot
 from warpir.scene.sheen import sheen_albedo_table
 
@@ -77,7 +77,7 @@ def with_factors(
     own: MaterialArgs, factors: Sequence[FloatArray | None], device: wp.Device
 ) -> MaterialArgs:
     """Return materials with other factors, in the order of `FACTORS`; None: their own."""
-    args = _copied(own)
+    args: MaterialArgs = copied(own)
     for factor, (name, dtype) in zip(factors, FACTORS, strict=True):
         if factor is not None:
             setattr(args, name, wp.array(factor, dtype=dtype, device=device))
@@ -98,16 +98,8 @@ def passed_straight(
         device: Warp device.
     """
     extensions = [_extensions(m, share) for m, share in zip(materials, shares, strict=True)]
-    args = _copied(own)
+    args: MaterialArgs = copied(own)
     args.extensions = wp.array(extensions, dtype=Extensions, device=device)
-    return args
-
-
-def _copied(own: MaterialArgs) -> MaterialArgs:
-    """Return a struct of the same arrays."""
-    args = MaterialArgs()
-    for name in cast(Any, own)._cls.vars:
-        setattr(args, name, getattr(own, name))
     return args
 
 
