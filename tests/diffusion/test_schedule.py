@@ -8,7 +8,6 @@ from warpir.diffusion.schedule import (
     TIME_LIMIT,
     NoiseSchedule,
     time_range,
-    weight,
 )
 from warpir.diffusion.settings import PREDICTION_TYPES
 
@@ -103,15 +102,6 @@ def test_schedule_without_terminal_signal_is_finite_at_one(prediction_type: str)
     assert torch.equal(noisy, noise)
     found = it.to_noise(it.target(latents, noise, t), noisy, t)
     torch.testing.assert_close(found, noise, rtol=0, atol=FLOAT32)
-
-
-def test_schedule_weights_follow_their_names() -> None:
-    alpha, sigma = torch.tensor([0.8]), torch.tensor([0.6])
-    expected = {"sigma2": 0.36, "sigma": 0.6, "uniform": 1.0}
-    for name, value in expected.items():
-        assert weight(name, alpha, sigma).item() == pytest.approx(value, rel=FLOAT32)
-        literal = weight(name, alpha, sigma, literal_alpha=True).item()
-        assert literal == pytest.approx(0.8 * value, rel=FLOAT32)
 
 
 def test_schedule_time_range_falls_linearly() -> None:
