@@ -81,9 +81,7 @@ class Personalization:
         """Return what a later run needs to go on with this adapter: tensors and plain values."""
         return {
             "adapter": self.adapter,
-            "weights": self.lora.weights,
-            "alphas": self.lora.alphas,
-            "targets": self.lora.targets,
+            **vars(self.lora),
             "losses": self.losses,
             "evaluation": self.evaluation,
             "class_prompts": self.class_prompts,

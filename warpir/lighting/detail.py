@@ -16,7 +16,7 @@ import numpy as np
 
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.latlong import map_directions, texel_solid_angles
+from warpir.core.latlong import interpolate, map_directions, texel_solid_angles
 from warpir.io.images.resize import resize
 from warpir.render.picture.photo_scene import photo_radiance
 from warpir.scene.camera import Camera
@@ -124,12 +124,7 @@ def _texel_sized(radiance: FloatArray, camera: Camera, rows: int) -> FloatArray:
 def _look_up(image: FloatArray, u: Float64Array, v: Float64Array, camera: Camera) -> FloatArray:
     """Read an image of any size at pixel positions of the camera, bilinear, shape [point, 3]."""
     height, width = image.shape[:2]
-    x = np.clip(u * (width / camera.width) - 0.5, 0.0, width - 1.0)
-    y = np.clip(v * (height / camera.height) - 0.5, 0.0, height - 1.0)
-    j, i = (np.minimum(a.astype(int), max(n - 2, 0)) for a, n in ((x, width), (y, height)))
-    across, down = (x - j)[:, None], (y - i)[:, None]
-    right, lower = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
-    top = image[i, j] * (1.0 - across) + image[i, right] * across
-    bottom = image[lower, j] * (1.0 - across) + image[lower, right] * across
-    read: FloatArray = (top * (1.0 - down) + bottom * down).astype(np.float32)
-    return read
+    # Unlike a map's, the columns of a photo do not wrap.
+    column = np.clip(u * (width / camera.width) - 0.5, 0.0, width - 1.0)
+    row = v * (height / camera.height) - 0.5
+    return interpolate(image, column, row).astype(np.float32)

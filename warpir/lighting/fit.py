@@ -104,14 +104,9 @@ def _errors(texels: FloatArray, lobes: Lobes) -> tuple[float, float]:
     fitted = cosine @ rasterize_lobes(lobes, FIT_HEIGHT, 2 * FIT_HEIGHT).reshape(-1, 3)
     scale = float(np.sqrt((truth**2).mean()))
     error = float(np.sqrt(((fitted - truth) ** 2).mean()))
-    flux = float(luminance((texel_flux(texels)).sum(axis=(0, 1))))
+    solid = texel_solid_angles(*texels.shape[:2])[:, None, None]
+    flux = float(luminance((texels.astype(np.float64) * solid).sum(axis=(0, 1))))
     fitted_flux = float(luminance(lobes.flux().sum(axis=0)))
     if scale <= 0.0 or flux <= 0.0:
         return error, abs(fitted_flux)
     return error / scale, abs(fitted_flux - flux) / flux
-
-
-def texel_flux(texels: FloatArray) -> Float64Array:
-    """Return radiance times solid angle of each texel, shape [He, We, 3]."""
-    omega = texel_solid_angles(texels.shape[0], texels.shape[1])
-    return texels.astype(np.float64) * omega[:, None, None]

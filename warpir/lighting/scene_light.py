@@ -16,6 +16,7 @@ from warpir.lighting.fit import LobeFit, fit_lobes
 from warpir.scene.lamps import lamp_axes, without_lamps
 from warpir.scene.light import Light, plain_sky, sun_lobe
 from warpir.scene.near.lamps import irradiance
+from warpir.scene.placement import foot_of_box
 from warpir.scene.receiver import first_hit
 from warpir.scene.shadow_mask import values_at
 from warpir.scene.tone_curves import Curves
@@ -235,8 +236,7 @@ def _ring(inputs: Inputs) -> Float64Array:
 
 def foot_of(inputs: Inputs) -> Float64Array:
     """Return the middle of the lower side of the object's box, world frame [m], shape [3]."""
-    low, high = inputs.asset.bounds()
-    middle = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
+    middle = np.append(foot_of_box(*inputs.asset.bounds()), 1.0)
     foot: Float64Array = (inputs.placement.asset_to_world @ middle)[:3]
     return foot
 

@@ -229,8 +229,7 @@ class MaterialRefinement(Optimization):
 
     def final_image(self, seed: int) -> Tensor:
         """Return the composite with the materials as they are."""
-        free: MaterialTensors = self.unknowns()
-        factors = free.base_color, free.metallic, free.roughness, free.emission
+        factors = vars(self.unknowns()).values()
         # The light is fixed, so there is no map to differentiate.
         foreground: Tensor = ShadeForeground.apply(
             self.mis, self.lit.args_fg, seed, torch.is_grad_enabled(), None, *factors

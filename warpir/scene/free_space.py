@@ -14,7 +14,7 @@ import numpy as np
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera
-from warpir.scene.placement import DEFAULT_STAND, box_corners, point_on_ground
+from warpir.scene.placement import DEFAULT_STAND, box_corners, foot_of_box, point_on_ground
 
 Place = tuple[float, float, float]
 
@@ -102,8 +102,7 @@ class Stand:
     @property
     def share_of_height(self) -> float:
         """How large the object is seen, by its longest side over the photo's height [1]."""
-        (x, y, z), (u, _, w) = self.low, self.high
-        away = self._away(np.array([(x + u) / 2.0, y, (z + w) / 2.0]))
+        away = self._away(foot_of_box(self.low, self.high))
         return float(self.longest / away * self.camera.fy / self.camera.height)
 
     def points_in_way(self, cloud: Cloud) -> Float64Array:

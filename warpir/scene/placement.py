@@ -61,7 +61,7 @@ class Placement:
             camera: Camera of the photo.
             sink: How deep the object was sunk [m].
         """
-        stand = self.asset_to_world[:3, :3] @ _foot(low, high) + self.asset_to_world[:3, 3]
+        stand = self.asset_to_world[:3, :3] @ foot_of_box(low, high) + self.asset_to_world[:3, 3]
         (at,) = camera.project((stand + sink * self.ground[:3])[None])
         return {
             "summary": self.summary,
@@ -216,11 +216,11 @@ def _standing(
     """Return the matrix that puts the centre of a bounding box's lowest face at a point."""
     asset_to_world = np.eye(4)
     asset_to_world[:3, :3] = scale * rotation
-    asset_to_world[:3, 3] = stand - scale * (rotation @ _foot(low, high))
+    asset_to_world[:3, 3] = stand - scale * (rotation @ foot_of_box(low, high))
     return asset_to_world
 
 
-def _foot(low: Float64Array, high: Float64Array) -> Float64Array:
+def foot_of_box(low: Float64Array, high: Float64Array) -> Float64Array:
     """Return the centre of a bounding box's lowest face, shape [3]."""
     return np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
 

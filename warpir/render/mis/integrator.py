@@ -96,11 +96,7 @@ class MisIntegrator:
                 args_shadow = light_args(host_light(light_shadow), scene.device)
         is_recording = torch.is_grad_enabled()
         foreground: Tensor = ShadeForeground.apply(
-            self, args_fg, seed, is_recording, light_fg, *_material(materials)
+            self, args_fg, seed, is_recording, light_fg, *vars(materials).values()
         )
         lit, unoccluded = ShadeReceiver.apply(self, args_shadow, seed, is_recording, light_shadow)
         return Radiance(foreground, lit, unoccluded)
-
-
-def _material(materials: MaterialTensors) -> tuple[Tensor | None, ...]:
-    return materials.base_color, materials.metallic, materials.roughness, materials.emission
