@@ -21,6 +21,7 @@ from warpir.lighting.regularizers import TrustRegion, bend, chroma, consistency,
 from warpir.lighting.sg_light import LightBounds, SGLight, bounded_ratios, narrowest
 from warpir.optimize.loop import Composite, Guide, Optimization
 from warpir.optimize.view import Frame, View, expected_light
+from warpir.render.bridge import compose
 from warpir.render.integrator import Radiance
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.render.transport.rows import TransportSettings
@@ -292,7 +293,7 @@ class LightOptimization(Optimization):
             tensors = self._recorded(torch.full((), scale, device=device))
             parts = Parts.of(tensors, self.term_names)
         curves = parts.curve_fg, parts.curve_shadow
-        image = self.view.compose(parts.radiance, *curves)
+        image = compose(self.view.constants, parts.radiance, *curves)
         if self.view.transport is None:
             with torch.no_grad():
                 shown = self._image(scale, *curves, self.seed + 2 * step + 1)
@@ -329,11 +330,13 @@ class LightOptimization(Optimization):
 
     def prepare(self, step: int) -> None:
         """Trace light transport again when its rows have become too noisy for the light."""
-        if self.view.transport is None or step == 0 or step % RETRACE_EVERY:
+        transport = self.view.transport
+        if transport is None or step == 0 or step % RETRACE_EVERY:
             return
         with torch.no_grad():
             texels = self.lights(self.fusion(step))
-            if self.view.staleness(*texels) > self.settings.retrace_at:
+            lights = (Light(texels=t.cpu().numpy()) for t in texels)
+            if transport.staleness(*lights) > self.settings.retrace_at:
                 self.expected = expected_light(*texels)
                 self.view = self._trace()
                 self.retraced += 1

@@ -124,18 +124,7 @@ class View:
             lamp_powers: Relative [W], shape [lamp, 3]; None: those of the scene's lamps.
         """
         radiance = self.integrator.radiance(texels_fg, texels_shadow, seed, lamp_powers=lamp_powers)
-        return self.compose(radiance, curve_fg, curve_shadow)
-
-    def compose(self, radiance: Radiance, curve_fg: Knots, curve_shadow: Knots) -> Tensor:
-        """Return the composite of rendered radiance, display-encoded, shape [1, 3, H, W]."""
         return compose(self.constants, radiance, curve_fg, curve_shadow)
-
-    def staleness(self, texels_fg: Tensor, texels_shadow: Tensor) -> float:
-        """Return the traced rows' noise under this light over that under the expected one [1]."""
-        if self.transport is None:
-            return 1.0
-        fg, shadow = (t.detach().cpu().numpy() for t in (texels_fg, texels_shadow))
-        return self.transport.staleness(Light(texels=fg), Light(texels=shadow))
 
 
 def _shaded(renderer: Renderer, expected: Light, seed: int) -> IntArray:
