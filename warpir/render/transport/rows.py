@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -100,8 +101,12 @@ class _ObjectTrace:
     direction_count: int
     """Number of directions of all texels."""
 
-    def rows(self, rows: IntArray, pixels: IntArray, subsamples: int, paths: int) -> ObjectRows:
-        """Trace some rows, by one interaction and by more."""
+    def rows(
+        self, pixels: IntArray, group: IntArray, subsamples: int, paths: int, start: int, stop: int
+    ) -> ObjectRows:
+        """Trace rows ``start`` to ``stop`` of a group, by one interaction and by more."""
+        rows = group[start:stop]
+        pixels = pixels[rows]
         renderer, texels, seed = self.renderer, self.texels, self.seed
         geometry = renderer.scene.geometry()
         points, emission = _surface_points(renderer, pixels, subsamples, seed)
@@ -150,17 +155,7 @@ def object_rows(
     trace = _ObjectTrace(renderer, texels, proposal, depth, seed, int(counts.sum()))
     for group, factor in _groups(renderer, pixels, settings, seed):
         subsamples, paths = factor * settings.subsamples, factor * settings.paths
-
-        def part(
-            start: int,
-            stop: int,
-            group: IntArray = group,
-            subsamples: int = subsamples,
-            paths: int = paths,
-        ) -> ObjectRows:
-            rows = group[start:stop]
-            return trace.rows(rows, pixels[rows], subsamples, paths)
-
+        part = partial(trace.rows, pixels, group, subsamples, paths)
         yield from renderer.memory.in_chunks(part, len(group), TRACING, LOWER_OBJECT)
 
 
