@@ -65,8 +65,8 @@ def read_regular(
     return content
 
 
-def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
-    """Resolve a relative file name, links included, and insist that it stays in ``folder``.
+def inside(uri: str, where: Path, pointer: str = "") -> Path:
+    """Resolve a relative file name, links included; it must stay in the folder of ``where``.
 
     The name has ``/`` and is already percent-decoded. An error names the asset ``where`` and the
     place in it, which is empty or ends in ``: ``.
@@ -89,7 +89,7 @@ def inside(folder: Path, uri: str, where: Path, pointer: str = "") -> Path:
     ):
         raise outside
     try:
-        root = folder.resolve()
+        root = where.parent.resolve()
         target = (root / uri).resolve()
     except (OSError, RuntimeError):  # a loop of links
         raise outside from None
@@ -135,7 +135,7 @@ def locate(uri: str, where: Path, pointer: str) -> Path:
         raise InputError(
             where, f"{pointer}URI is not UTF-8 after percent-decoding", reason="file.name"
         ) from None
-    return inside(where.parent, name, where, pointer)
+    return inside(name, where, pointer)
 
 
 class TextureDecoder:

@@ -138,9 +138,9 @@ class MaterialLibrary:
                 folder, or damaged.
         """
         names = names.replace("\\", "/")
-        whole = inside(self.path.parent, names, self.path, "mtllib ")
+        whole = inside(names, self.path, "mtllib ")
         for name in [names] if os.path.exists(whole) else names.split():
-            file = inside(self.path.parent, name, self.path, "mtllib ")
+            file = inside(name, self.path, "mtllib ")
             try:
                 content = read_regular(file, self.path, self._limits, "mtllib ", hashes=self.hashes)
             except InputError as error:
@@ -169,10 +169,6 @@ class MaterialLibrary:
             self._index[name] = len(self.materials)
             self.materials.append(material)
         return self._index[name]
-
-    def is_textured(self, index: int) -> bool:
-        """Return whether material ``index`` reads any texture."""
-        return bool(self.materials[index].texture_slots())
 
     def _parse(self, content: bytes, file: str) -> None:
         try:
@@ -439,7 +435,7 @@ class MaterialLibrary:
         name = statement.name
         if name not in self._pixels:
             where = f"{name}: "
-            file = inside(self.path.parent, name, self.path)
+            file = inside(name, self.path)
             try:
                 encoded = read_regular(
                     file, self.path, self._limits, "texture ", hashes=self.hashes

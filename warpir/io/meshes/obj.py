@@ -279,7 +279,7 @@ def _read_primitive(
         stated = vertices.uvs[np.maximum(uv, 0)] * (uv >= 0)[:, None]
         uv0 = np.column_stack([stated[:, 0], 1.0 - stated[:, 1]]).astype(np.float32)
     material = library.index(name, white=vertices.colors is not None)
-    if uv0 is None and library.is_textured(material):
+    if uv0 is None and library.materials[material].texture_slots():
         notices.append(f"material {name!r}: no texture coordinates, zero is used")
         uv0 = np.zeros((len(points), 2), dtype=np.float32)
     colors = None if vertices.colors is None else vertices.colors[position]
