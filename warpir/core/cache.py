@@ -46,19 +46,16 @@ def cache_folder(kind: str = "") -> Path:
     Raises:
         InputError: There is no folder for temporary files either (`ExitCode.RESOURCES`).
     """
+    root = Path("~/.cache/warpir")
     try:
         root = Path(os.environ.get("WARPIR_CACHE") or _users_cache() / "warpir")
+        _check(root)
+        return root / kind
     except (OSError, RuntimeError) as error:
-        root, why = Path("~/.cache/warpir"), error
-    else:
-        try:
-            _check(root)
-            return root / kind
-        except OSError as found:
-            why = found
+        why = _reason(error)
     if root not in _replaced:
         _replaced[root] = _temporary("warpir-cache-")
-        notice(f"{root}: {_reason(why)}: what is made is kept for this run only (WARPIR_CACHE)")
+        notice(f"{root}: {why}: what is made is kept for this run only (WARPIR_CACHE)")
     return _replaced[root] / kind
 
 
@@ -167,10 +164,9 @@ class KernelCache:
         except OSError:  # the run is over and has its result: the next one compiles again
             return
 
-    def _kept(self) -> Iterator[Path]:
+    def _kept(self) -> list[Path]:
         assert self.store is not None
-        if self.store.exists():
-            yield from sorted(f for folder in self.store.iterdir() for f in _files(folder))
+        return sorted(file for file in self.store.glob("*/*") if file.is_file())
 
     def _place(self, kept: Path) -> Path:
         """Return where Warp looks for a kept file, below its folder."""
@@ -178,10 +174,9 @@ class KernelCache:
 
     def _compiled(self) -> Iterator[Path]:
         """Yield what this process has compiled: what was linked is not a file of its own."""
-        for folder in sorted((self.folder / self.version).glob("wp_*")):
-            for file in _files(folder):
-                if file.suffix in KERNEL_SUFFIXES and not file.is_symlink():
-                    yield file
+        for file in sorted((self.folder / self.version).glob("wp_*/*")):
+            if file.suffix in KERNEL_SUFFIXES and file.is_file() and not file.is_symlink():
+                yield file
 
     def _link(self, kept: Path) -> bool:
         """Make a kept file visible to Warp; return whether it was whole, else it is removed."""
@@ -256,11 +251,6 @@ def _check(folder: Path) -> None:
         if place == folder or os.path.lexists(place):
             with tempfile.TemporaryFile(dir=place) as probe:
                 probe.write(b"0")
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    if folder.is_dir():
-        yield from (f for f in sorted(folder.iterdir()) if f.is_file())
 
 
 def _temporary(prefix: str) -> Path:
