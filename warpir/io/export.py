@@ -22,7 +22,7 @@ from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX
 from warpir.io.results import OutputFolder
 from warpir.scene.asset import Asset
-from warpir.scene.camera import Camera, blender_camera, square_pixel_error
+from warpir.scene.camera import TO_Z_UP, Camera, blender_camera, square_pixel_error
 from warpir.scene.lamps import LAMP_RADIUS_DEG, Sun, suns_of
 from warpir.scene.placement import Placement, y_to
 from warpir.scene.tone_curves import Curves, ToneKnots
@@ -37,9 +37,6 @@ GROUND_SIDES = 40.0
 """Side of Blender's ground, in diagonals of the object."""
 SQUARE_ENOUGH = 0.5
 """How far rows may be off in a tool that knows square pixels only, before it is said [px]."""
-
-TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
-"""Blender's world from ours, column vectors."""
 
 
 def write_hand_off(
@@ -171,7 +168,7 @@ def blender_setup(
         near=1e-3 * distance,
         far=1e3 * (distance + diagonal),
         camera=_rows(values["matrix_world"]),
-        ground=_rows(_z_up(ground)),
+        ground=_rows(TO_Z_UP @ ground @ TO_Z_UP.T),
         ground_size=GROUND_SIDES * diagonal,
         suns=[
             (*_tuples(TO_Z_UP[:3, :3] @ sun.axis, sun.irradiance), sun.angle, *_tuples(sun.behind))
@@ -184,12 +181,6 @@ def blender_setup(
 def _tuples(*vectors: Float64Array) -> tuple[tuple[float, ...], ...]:
     """Return vectors as plain numbers; minus zero is zero."""
     return tuple(tuple(float(value) + 0.0 for value in vector) for vector in vectors)
-
-
-def _z_up(matrix: Float64Array) -> Float64Array:
-    """Return a matrix of our frames, +Y up, as one of Blender's, +Z up on both sides."""
-    turned: Float64Array = TO_Z_UP @ matrix @ TO_Z_UP.T
-    return turned
 
 
 def _rows(matrix: Float64Array) -> str:

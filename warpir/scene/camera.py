@@ -22,6 +22,9 @@ FILM_DIAGONAL_35MM = 43.267
 TILE = 16
 """Side of the tiles of `Camera.tiles_of` [px]."""
 
+TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+"""Blender's world from ours, column vectors."""
+
 
 class Source(NamedTuple):
     """Where a number of a camera comes from, and how wrong it may be."""
@@ -228,9 +231,8 @@ def blender_camera(camera: Camera) -> dict[str, Any]:
         ``angle``: across the longer side [rad]; ``shift_x`` and ``shift_y``: shares of it.
     """
     longer = max(camera.width, camera.height)
-    y_up_to_z_up = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
     return {
-        "matrix_world": y_up_to_z_up @ camera.c2w,
+        "matrix_world": TO_Z_UP @ camera.c2w,
         "angle": float(2.0 * np.arctan(longer / 2.0 / camera.fx)),
         "shift_x": (camera.width / 2.0 - camera.cx) / longer,
         "shift_y": (camera.cy - camera.height / 2.0) / longer,
