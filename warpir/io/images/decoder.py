@@ -421,12 +421,7 @@ def _read_row(reader: Any, part: int, spec: Any, y: int) -> PixelArray | None:
 
 def _place_in_display_window(pixels: PixelArray, spec: Any) -> PixelArray:
     """Crop or pad the data window of an EXR, with zeros, to its display window."""
-    if (spec.x, spec.y, spec.width, spec.height) == (
-        spec.full_x,
-        spec.full_y,
-        spec.full_width,
-        spec.full_height,
-    ):
+    if spec.roi == spec.roi_full:
         return pixels
     placed = np.zeros((spec.full_height, spec.full_width, pixels.shape[-1]), pixels.dtype)
     x0, y0 = max(spec.x, spec.full_x), max(spec.y, spec.full_y)

@@ -80,10 +80,7 @@ def header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
     if kind == "exr" and abs(aspect - 1.0) > 1e-3:
         notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")
-    beyond = min(spec.x - spec.full_x, spec.y - spec.full_y) < 0
-    beyond |= spec.x + spec.width > spec.full_x + spec.full_width
-    beyond |= spec.y + spec.height > spec.full_y + spec.full_height
-    if kind == "exr" and beyond:
+    if kind == "exr" and not spec.roi_full.contains(spec.roi):
         notices.append("overscan, beyond the display window, is left out")
     corrections = _radiance_lines(head, b"(?:GAMMA|COLORCORR)") if kind == "hdr" else []
     if any(set(line.split()) - {b"1", b"1.0"} for line in corrections):

@@ -20,8 +20,8 @@ _MOST_SCANS = 100
 """Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 
 
-def check_regular_file(path: Path) -> int:
-    """Return the size of a regular file [byte], before any library opens it (a FIFO blocks).
+def check_regular_file(path: Path) -> None:
+    """Refuse what is no regular file, before any library opens it (a FIFO blocks).
 
     Raises:
         InputError: Missing, a folder, a device, empty, or not readable.
@@ -40,7 +40,6 @@ def check_regular_file(path: Path) -> int:
         raise InputError(path, what, reason="file.not_regular", found=kind)
     if status.st_size == 0:
         raise InputError(path, "empty file", reason="file.empty")
-    return status.st_size
 
 
 def sniff(path: Path) -> tuple[str, bytes]:
