@@ -138,15 +138,13 @@ def convert(value: Any, hint: Any, separator: str = ",") -> Any:
         if len(parts) != len(kinds):
             raise ValueError
         return tuple(convert(part, kind) for part, kind in zip(parts, kinds, strict=True))
-    if isinstance(value, bool) or hint is bool:
-        if isinstance(value, bool) and hint is bool:
-            return value
+    if hint in (bool, str):
+        if not isinstance(value, hint):
+            raise ValueError
+        return value
+    if not isinstance(value, str | int | float) or isinstance(value, bool):
         raise ValueError
-    if hint is str:
-        if isinstance(value, str):
-            return value
-        raise ValueError
-    if not isinstance(value, str | int | float) or (hint is int and isinstance(value, float)):
+    if hint is int and isinstance(value, float):
         raise ValueError
     if isinstance(value, str) and "_" in value:
         raise ValueError  # Python would read 1_0 as 10

@@ -10,10 +10,9 @@ import base64
 import io
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, WebPImagePlugin
@@ -159,11 +158,8 @@ def _box_of(chosen: BoolArray) -> Box | None:
 
 def _cropped(layers: Layers, box: Box) -> Layers:
     left, top, right, bottom = box
-    planes = {f.name: getattr(layers, f.name) for f in fields(layers)}
-    part: dict[str, Any] = {
-        n: p[top:bottom, left:right] for n, p in planes.items() if p is not None
-    }
-    return Layers(**part)
+    planes = {n: p[top:bottom, left:right] for n, p in vars(layers).items() if p is not None}
+    return Layers(**planes)
 
 
 # --------------------------------------------------------------------------------- layers

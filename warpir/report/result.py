@@ -21,7 +21,7 @@ from warpir.io.results import OutputFolder
 from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import CameraLook, estimate_look, look_of_preview, region_around
 from warpir.look.denoise import denoiser_version
-from warpir.render.composite import UNCHANGED, Picture, make_picture
+from warpir.render.composite import Picture, make_picture
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.photo_scene import scene_of
 from warpir.render.picture.quality import Quality
@@ -146,7 +146,7 @@ def _picture(
     renderer: Renderer,
     samples: int,
     rays: int,
-    look: CameraLook = UNCHANGED,
+    look: CameraLook,
 ) -> Picture:
     inputs, quality = run.inputs, run.config.render
     return make_picture(
