@@ -232,24 +232,19 @@ def _length(kind: str, body: bytes, at: int) -> tuple[int, int]:
 
 def _read_uneven(element: Element, types: dict[str, tuple[str, str]], body: bytes, at: int) -> int:
     """Read rows whose lists differ in length, one by one."""
-    starts: dict[str, list[int]] = {name: [] for name in types}
-    counts: dict[str, list[int]] = {name: [] for name in types}
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in types}
     for _ in range(element.count):
         for name, (kind, length) in types.items():
             count = 1
             if length:
                 count, at = _length(length, body, at)
-            starts[name].append(at)
-            counts[name].append(count)
-            at += count * np.dtype(kind).itemsize
-    for name, (kind, length) in types.items():
-        parts = [
-            np.frombuffer(body, kind, count, start)
-            for start, count in zip(starts[name], counts[name], strict=True)
-        ]
-        values = np.concatenate(parts)
+            parts[name].append(np.frombuffer(body, kind, count, at))
+            at += parts[name][-1].nbytes
+    for name, (_, length) in types.items():
+        values = np.concatenate(parts[name])
         if length:
-            element.lists[name] = Lists(np.array(counts[name], dtype=np.int64), values)
+            lengths = np.array([len(part) for part in parts[name]], dtype=np.int64)
+            element.lists[name] = Lists(lengths, values)
         else:
             element.columns[name] = values
     return at
