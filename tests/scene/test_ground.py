@@ -15,8 +15,9 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import read_inputs
 from warpir.app.photo_world import make_world
 from warpir.app.settings import CameraConfig
+from warpir.core.arrays import affine_matrix
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.cameras.source import PhotoCamera, turned
+from warpir.io.cameras.source import PhotoCamera
 from warpir.io.images.photos import read_photo
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.camera import Camera, camera_from_fov
@@ -231,7 +232,7 @@ def test_points_turn_with_the_camera_file_s_world(rng: np.random.Generator) -> N
 def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) -> None:
     """Any turn of world, camera and points gives the level ground, the view and heights back."""
     rotation = pose(rng, 2.0)[:3, :3]
-    camera = replace(CAMERA, c2w=turned(CAMERA.c2w, rotation))
+    camera = replace(CAMERA, c2w=affine_matrix(rotation) @ CAMERA.c2w)
     points = street(rng)
     view = PhotoCamera(camera, has_up=False)
     made = make_world(CameraConfig(ground_points="x"), None, view, points @ rotation.T)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from warpir.app.settings import CameraConfig, PlacementConfig
-from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.arrays import Float64Array, FloatArray, affine_matrix
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.reader import read_photo_camera
-from warpir.io.cameras.source import PhotoCamera, turned
+from warpir.io.cameras.source import PhotoCamera
 from warpir.io.images.photos import Photo
 from warpir.scene.asset import Asset
 from warpir.scene.camera import (
@@ -290,7 +290,7 @@ def make_world(
             )
         plane = upright_plane(ground, camera.c2w[:3, 3])
         level = y_to(plane[:3]).T
-        camera = replace(camera, c2w=turned(camera.c2w, level))
+        camera = replace(camera, c2w=affine_matrix(level) @ camera.c2w)
         ground = _four(np.append(level @ plane[:3], plane[3]))
         if place is not None:
             x, y, z = (float(component) for component in level @ place)

@@ -1,11 +1,11 @@
-"""The kinds of NumPy array that annotations name, one alias each; boxes and bands of rows."""
+"""The kinds of NumPy array that annotations name, one alias each; transforms, boxes, bands."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from warpir.core.memory import core_count
 
@@ -25,6 +25,17 @@ PixelArray = NDArray[Any]
 BAND = 1 << 15
 """Pixels that are computed at once: their float64 colours take less than the MiB from which memory
 is asked of the system anew (`warpir.core.memory.sparing`)."""
+
+
+def affine_matrix(linear: ArrayLike, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
+    """Return the matrix of a linear map, shape [3, 3], and an offset [m], shape [4, 4].
+
+    It multiplies column vectors.
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = offset
+    return matrix
 
 
 def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:

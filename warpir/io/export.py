@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import warpir
-from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.arrays import Float64Array, FloatArray, affine_matrix
 from warpir.io.gltf.writer import write_glb
 from warpir.io.images.envmap_conventions import from_ours
 from warpir.io.images.photos import Photo
@@ -149,9 +149,7 @@ def blender_setup(
     diagonal = float(np.linalg.norm((high - low) * np.linalg.norm(placement.asset_to_world[:3, 0])))
     middle = (placement.asset_to_world @ np.append(0.5 * (low + high), 1.0))[:3]
     normal, offset = placement.ground[:3], float(placement.ground[3])
-    ground = np.eye(4)
-    ground[:3, :3] = y_to(normal)
-    ground[:3, 3] = middle - normal * (normal @ middle + offset)
+    ground = affine_matrix(y_to(normal), middle - normal * (normal @ middle + offset))
     distance = float(np.linalg.norm(middle - camera.c2w[:3, 3]))
     values = blender_camera(camera)
     template = Template(files("warpir.io").joinpath("blender_setup.py.in").read_text("utf-8"))

@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.core.errors import InputError
-from warpir.io.gltf.writer import float32_center, translation
+from warpir.io.gltf.writer import float32_center
 from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
 from warpir.scene.camera import Camera
 from warpir.scene.near.lamps import Lamp, RectangleLamp
@@ -90,8 +90,7 @@ def _camera(stage: Usd.Stage, camera: Camera) -> None:
 
 def _lamp(stage: Usd.Stage, lamp: Lamp, path: str) -> None:
     """Write a lamp; a light of USD that is not normalised has its intensity as radiance."""
-    pose = np.eye(4)
-    pose[:3, 3] = lamp.center
+    pose = affine_matrix(np.eye(3), lamp.center)
     if isinstance(lamp, RectangleLamp):
         width, height = (float(np.linalg.norm(edge)) for edge in (lamp.edge_x, lamp.edge_y))
         written = UsdLux.RectLight.Define(stage, path)
@@ -112,7 +111,7 @@ def _lamp(stage: Usd.Stage, lamp: Lamp, path: str) -> None:
 def _object(stage: Usd.Stage, asset: Asset, asset_to_world: Float64Array) -> None:
     center = float32_center(asset)
     root = UsdGeom.Xform.Define(stage, "/scene/object")
-    root.AddTransformOp().Set(_matrix(asset_to_world @ translation(center)))
+    root.AddTransformOp().Set(_matrix(asset_to_world @ affine_matrix(np.eye(3), center)))
     slots = [slot for material in asset.materials for slot in material.texture_slots()]
     keys = dict.fromkeys((slot.uv_set, slot.transform) for slot in slots)
     names: Names = {key: f"st{k}" for k, key in enumerate(keys)}

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.scene.placement import turn, y_to
 
 X, Y, Z = np.eye(3)
@@ -36,10 +36,8 @@ class Stance:
     def c2w(self) -> Float64Array:
         """Return the pose, camera to ground frame, shape [4, 4]."""
         heading, pitch, roll = (math.radians(a) for a in (self.heading, self.pitch, self.roll))
-        pose = np.eye(4)
-        pose[:3, :3] = turn(Y, heading) @ turn(X, pitch) @ turn(Z, roll)
-        pose[:3, 3] = self.x, self.height, self.z
-        return pose
+        rotation = turn(Y, heading) @ turn(X, pitch) @ turn(Z, roll)
+        return affine_matrix(rotation, (self.x, self.height, self.z))
 
     def record(self) -> dict[str, float]:
         """Return the numbers by their names."""
@@ -68,7 +66,4 @@ def ground_to_world(plane: Float64Array) -> Float64Array:
     Args:
         plane: (a, b, c, d) with a unit normal toward the camera (`upright_plane`), shape [4].
     """
-    pose = np.eye(4)
-    pose[:3, :3] = y_to(plane[:3])
-    pose[:3, 3] = -plane[3] * plane[:3]
-    return pose
+    return affine_matrix(y_to(plane[:3]), -plane[3] * plane[:3])

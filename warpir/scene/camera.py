@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warpir.core.arrays import BoolArray, Float64Array, IntArray
+from warpir.core.arrays import BoolArray, Float64Array, IntArray, affine_matrix
 from warpir.core.errors import ExitCode, InputError
 
 FILM_DIAGONAL_35MM = 43.267
@@ -312,10 +312,7 @@ def camera_pose(pitch_deg: float, roll_deg: float, camera_height: float) -> Floa
     tilt = [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)]]
     tilt.append([0, math.sin(pitch), math.cos(pitch)])
     turn = [[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]]
-    pose = np.eye(4)
-    pose[:3, :3] = np.array(tilt) @ np.array(turn)
-    pose[1, 3] = camera_height
-    return pose
+    return affine_matrix(np.array(tilt) @ np.array(turn), (0.0, camera_height, 0.0))
 
 
 def camera_from_fov(

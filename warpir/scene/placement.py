@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.core.errors import InputError
 from warpir.scene.camera import Camera, ground_point
 from warpir.scene.receiver import ReceiverMesh, first_hit
@@ -214,10 +214,7 @@ def _standing(
     low: Float64Array, high: Float64Array, scale: float, rotation: Float64Array, stand: Float64Array
 ) -> Float64Array:
     """Return the matrix that puts the centre of a bounding box's lowest face at a point."""
-    asset_to_world = np.eye(4)
-    asset_to_world[:3, :3] = scale * rotation
-    asset_to_world[:3, 3] = stand - scale * (rotation @ foot_of_box(low, high))
-    return asset_to_world
+    return affine_matrix(scale * rotation, stand - scale * (rotation @ foot_of_box(low, high)))
 
 
 def foot_of_box(low: Float64Array, high: Float64Array) -> Float64Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.core.limits import Limits
 from warpir.io.cameras.colmap_model import (
     COLMAP,
@@ -82,8 +82,6 @@ def _pose(path: Path, image: Image) -> Float64Array:
         )
     w, x, y, z = image.quaternion
     world_to_camera = from_trs((0.0,) * 3, (x, y, z, w), (1.0,) * 3)[:3, :3]
-    c2w = np.eye(4)
     # OpenCV's camera axes become ours: y and z change their signs.
-    c2w[:3, :3] = world_to_camera.T * [1.0, -1.0, -1.0]
-    c2w[:3, 3] = -world_to_camera.T @ np.array(image.translation)
-    return c2w
+    axes = world_to_camera.T * [1.0, -1.0, -1.0]
+    return affine_matrix(axes, -world_to_camera.T @ np.array(image.translation))

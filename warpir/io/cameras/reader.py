@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from warpir.core.arrays import affine_matrix
 from warpir.core.errors import ExitCode, InputError, shown
 from warpir.core.limits import LIMITS, Limits
 from warpir.core.strict_json import read_json_object
@@ -25,7 +26,6 @@ from warpir.io.cameras.source import (
     focal_length,
     number,
     rigid,
-    turned,
 )
 from warpir.io.cameras.waymo import read_waymo
 from warpir.scene.camera import Camera
@@ -72,7 +72,7 @@ def read_photo_camera(
     if axis is not None:
         camera = replace(view.camera, assumed=())
         view = replace(view, camera=camera, world=UP_TO_Y[axis], has_up=True)
-    camera = replace(view.camera, c2w=turned(view.camera.c2w, view.world))
+    camera = replace(view.camera, c2w=affine_matrix(view.world) @ view.camera.c2w)
     return replace(view, camera=_fit(path, camera, photo_size))
 
 

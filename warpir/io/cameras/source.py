@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.core.errors import Faults
 from warpir.scene.camera import Camera
 from warpir.scene.lens import STRAIGHT, Lens
@@ -91,14 +91,6 @@ class PhotoCamera:
     """Whether it is known which way is up; else our world is the file's, as it happens to lie."""
 
 
-def turned(c2w: Float64Array, rotation: Float64Array) -> Float64Array:
-    """Return a pose, shape [4, 4], after its world was turned by a rotation, shape [3, 3]."""
-    turn = np.eye(4)
-    turn[:3, :3] = rotation
-    result: Float64Array = turn @ c2w
-    return result
-
-
 def choose_frame(
     path: Path, names: Sequence[str], frame: str | None, photo: str | None, noun: str = "image"
 ) -> int:
@@ -154,10 +146,7 @@ def rigid(path: Path, name: str, rows: Any) -> Float64Array:
     if np.linalg.det(rotation) < 0.0:
         raise CAMERA.error(path, "left_handed", pointer=pointer, found="determinant -1")
     left, _, right = np.linalg.svd(rotation)
-    rigid = np.eye(4)
-    rigid[:3, :3] = left @ right
-    rigid[:3, 3] = matrix[:3, 3]
-    return rigid
+    return affine_matrix(left @ right, matrix[:3, 3])
 
 
 def _affine(path: Path, pointer: str, rows: Any) -> Float64Array:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from warpir.core.arrays import affine_matrix
 from warpir.core.strict_json import read_numbers
 from warpir.io.cameras.source import (
     CAMERA,
@@ -51,10 +52,8 @@ def read_waymo(path: Path, content: dict[str, Any], frame: str | None) -> PhotoC
     transform = member(path, entry, "extrinsic").get("transform")
     flat = read_numbers(path, "/extrinsic/transform", transform, 16)
     camera_to_vehicle = rigid(path, "extrinsic/transform", np.reshape(flat, (4, 4)))
-    axes = np.eye(4)
-    axes[:3, :3] = OURS_TO_WAYMO
     size = count(path, entry, "width"), count(path, entry, "height")
-    camera = Camera(*size, fx, fy, cx, cy, camera_to_vehicle @ axes)
+    camera = Camera(*size, fx, fy, cx, cy, camera_to_vehicle @ affine_matrix(OURS_TO_WAYMO))
     return PhotoCamera(camera, Lens((k1, k2, k3, 0.0), (p1, p2)), OURS_TO_WAYMO.T)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, affine_matrix
 from warpir.core.limits import Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.meshes.triangles import EXTENT
@@ -95,10 +95,7 @@ def from_trs(
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(turn) * scale
-    matrix[:3, 3] = translation
-    return matrix
+    return affine_matrix(np.array(turn) * scale, translation)
 
 
 def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Float64Array]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import warpir
-from warpir.core.arrays import CodeArray, Float64Array, FloatArray, PixelArray
+from warpir.core.arrays import CodeArray, Float64Array, FloatArray, PixelArray, affine_matrix
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
@@ -53,7 +53,7 @@ def write_glb(asset: Asset, asset_to_world: Float64Array, camera: Camera | None 
     """
     file = _Glb()
     center = float32_center(asset)
-    placed = asset_to_world @ translation(center)
+    placed = asset_to_world @ affine_matrix(np.eye(3), center)
     nodes = [{"name": asset.name, "mesh": 0} | _matrix(placed)]
     document: Members = {
         "asset": {
@@ -103,13 +103,6 @@ def float32_center(asset: Asset) -> Float64Array:
         return np.zeros(3)
     center: Float64Array = (low + high) / 2.0
     return center
-
-
-def translation(offset: Float64Array) -> Float64Array:
-    """Return the matrix that moves by ``offset`` [m], shape [4, 4]."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = offset
-    return matrix
 
 
 @dataclass
