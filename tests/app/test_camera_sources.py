@@ -268,14 +268,18 @@ def test_width_that_makes_too_many_pixels_is_refused(folder: Path, tmp_path: Pat
 # ------------------------------------------------------------------------- where nothing is placed
 
 
-@pytest.mark.parametrize("pitch", [-35.0, -10.0, 8.0, 15.0])
+@pytest.mark.parametrize(
+    ("vfov", "pitch"),
+    [(40.0, -35.0), (40.0, -10.0), (40.0, 8.0), (40.0, 15.0), (25.0, -12.0), (31.0, -16.0)],
+)
 @pytest.mark.parametrize("size", [0.02, 0.5, 3.0, 40.0])
 def test_unplaced_object_is_whole_and_of_a_size_that_is_seen(
-    folder: Path, tmp_path: Path, pitch: float, size: float
+    folder: Path, tmp_path: Path, vfov: float, pitch: float, size: float
 ) -> None:
     """On the ground below the horizon, upright, not cut by the frame, neither tiny nor huge."""
     trimesh.creation.box(extents=(size, 0.6 * size, 0.5 * size)).export(tmp_path / "b.glb")
-    inputs = read(folder, Asked(pitch_deg=pitch), asset=tmp_path / "b.glb")
+    asked = Asked(pitch_deg=pitch, vfov_deg=vfov)
+    inputs = read(folder, asked, asset=tmp_path / "b.glb")
     camera, matrix = inputs.camera, inputs.placement.asset_to_world
     assert sources(inputs)["pitch_deg"] == "estimate"
     corners = inputs.asset.corners() @ matrix[:3, :3].T + matrix[:3, 3]
@@ -300,6 +304,12 @@ def test_asked_size_is_kept(folder: Path) -> None:
     inputs = read(folder, Asked(), size=0.02)
     scale = np.linalg.norm(inputs.placement.asset_to_world[:3, 0])
     assert scale * 0.5 == pytest.approx(0.02)
+
+
+def test_object_of_an_asked_size_is_not_said_to_be_whole_where_it_is_cut(folder: Path) -> None:
+    inputs = read(folder, Asked(pitch_deg=-16.0, vfov_deg=25.0), size=2.0)
+    assert any("may be cut" in line for line in inputs.notices)
+    assert not any("seen whole" in line for line in inputs.assumed)
 
 
 def test_object_that_is_placed_keeps_its_size_and_is_said_to_be_tiny(folder: Path) -> None:

@@ -28,7 +28,15 @@ from warpir.scene.camera import (
 )
 from warpir.scene.free_space import Cloud, Place, Stand, find_place
 from warpir.scene.ground import fit_ground
-from warpir.scene.placement import Placement, place_asset, settled, upright_plane, y_to
+from warpir.scene.placement import (
+    DEFAULT_STAND,
+    Placement,
+    place_asset,
+    point_on_ground,
+    settled,
+    upright_plane,
+    y_to,
+)
 from warpir.scene.receiver import ReceiverMesh
 
 DEFAULT_FOV = 60.0
@@ -41,7 +49,7 @@ WORDS = {"pitch_deg": "pitch", "roll_deg": "roll", "vfov_deg": "vertical field o
 """What the numbers are called where they are printed."""
 SEEN = (0.04, 1.0)
 """Longest side of an object that was given no size, over the photo's height, within which it keeps
-its own: smaller ones are hardly seen, larger ones not whole."""
+its own where it is whole: smaller ones are hardly seen, larger ones fill the photo."""
 SHOWN = 0.25
 """The same where it does not."""
 LOOKING_DOWN = -30.0
@@ -396,30 +404,45 @@ def _set_free(
                 return usual
     eye = world.camera.c2w[:3, 3]
     plane = upright_plane(world.ground, eye)
-    lines = []
+    own, seen, lines = float((high - low).max()), math.inf, []
     try:
         place = find_place(stand, world.camera, plane, world.cloud)
     except InputError:
         if is_sized or world.cloud is not None:
             raise
         # So large that the camera is inside wherever it stands: begin with what lies ahead.
-        away, seen = 2.0 * float(plane[:3] @ eye + plane[3]), math.inf
+        away = 2.0 * float(plane[:3] @ eye + plane[3])
     else:
         placement = put(place)
         away = float(np.linalg.norm(np.subtract(place, eye)))
-        seen = stand(place).share_of_height
+        if not stand(place).is_cut:
+            seen = stand(place).share_of_height
     if not is_sized and not SEEN[0] <= seen <= SEEN[1]:
+        away = min(away, _usual_distance(world.camera, plane))
         size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
         place = find_place(lambda there: stand(there, size), world.camera, plane, world.cloud)
         placement = put(place, size)
         lines.append(
-            f"the object is {size:g} m large, since with its own {float((high - low).max()):.3g} m "
-            f"it would be {'hardly seen' if seen < SHOWN else 'cut'} (--size, --scale)"
+            f"the object is {size:g} m large, since with its own {own:.3g} m "
+            f"it would be {'hardly seen' if own < size else 'cut'} (--size, --scale)"
         )
     shown = ",".join(f"{round(x, 3) + 0.0:.3g}" for x in place)
-    why = "it is seen whole" if world.cloud is None else "no points are in its way"
-    lines.append(f"the object stands at {shown}, where {why} (--at, --place)")
+    why = "where no points are in its way"
+    if world.cloud is None:
+        is_cut = Stand(placement.asset_to_world, low, high, world.camera).is_cut
+        why = "since the frame cuts it everywhere" if is_cut else "where it is seen whole"
+    lines.append(f"the object stands at {shown}, {why} (--at, --place)")
     return replace(placement, assumed=(*placement.assumed, *lines))
+
+
+def _usual_distance(camera: Camera, plane: Float64Array) -> float:
+    """Return how far away the ground of the usual pixel is [m]; infinite where there is none."""
+    pixel = DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height
+    try:
+        point = point_on_ground(pixel, camera, plane)
+    except InputError:
+        return math.inf
+    return float(np.linalg.norm(point - camera.c2w[:3, 3]))
 
 
 def _four(plane: Float64Array) -> tuple[float, float, float, float]:
