@@ -28,10 +28,7 @@ is asked of the system anew (`warpir.core.memory.sparing`)."""
 
 
 def affine_matrix(linear: ArrayLike, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
-    """Return the matrix of a linear map, shape [3, 3], and an offset [m], shape [4, 4].
-
-    It multiplies column vectors.
-    """
+    """Return the matrix [4, 4], of column vectors, of a linear map [3, 3] and an offset [3]."""
     matrix = np.eye(4)
     matrix[:3, :3] = linear
     matrix[:3, 3] = offset

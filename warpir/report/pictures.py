@@ -109,7 +109,7 @@ def thumbnail(path: Path, max_pixels: int) -> Shown:
         InputError: It cannot be read.
     """
     found = decode_image(path, max_pixels)
-    # CodeArray of 16 bits are 257 times those of 8.
+    # Codes of 16 bits are 257 times those of 8.
     is_deep = found.pixels.dtype != np.uint8
     codes: CodeArray = (found.pixels // 257).astype(np.uint8) if is_deep else found.pixels
     image = Image.fromarray(codes[..., 0] if codes.shape[-1] == 1 else codes).convert("RGB")
