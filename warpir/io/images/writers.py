@@ -56,14 +56,7 @@ def png_bytes(
         description: Text for the ``Description`` field.
         level: Of zlib; photos at 1 take a quarter of the time and a sixteenth more bytes.
     """
-    if (
-        codes.dtype not in (np.uint8, np.uint16)
-        or codes.ndim not in (2, 3)
-        or (codes.ndim == 3 and codes.shape[2] != 3)
-    ):
-        raise ValueError(
-            f"uint8 or uint16 codes [H, W, 3] or [H, W] are needed, got {codes.dtype} {codes.shape}"
-        )
+    assert codes.dtype in (np.uint8, np.uint16) and codes.shape[2:] in ((), (3,)), codes.shape
     height, width = codes.shape[:2]
     # Samples are big-endian; each row is preceded by its filter: 2, difference to the row above.
     big_endian = np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder(">"))
@@ -126,11 +119,7 @@ def exr_bytes(
 
     planes = {}
     for channel, plane in channels.items():
-        if plane.dtype not in (np.float16, np.float32) or plane.ndim != 2:
-            raise ValueError(
-                f"{channel}: float16 or float32 planes [H, W] are needed, got "
-                f"{plane.dtype} {plane.shape}"
-            )
+        assert plane.dtype in (np.float16, np.float32) and plane.ndim == 2, channel
         bad = plane.size - np.count_nonzero(np.isfinite(plane))
         if bad:
             what = f"channel {channel} is not finite (found {bad} bad values)"
@@ -161,8 +150,7 @@ def envmap_exr_bytes(where: Path, texels: FloatArray) -> bytes:
     """
     import OpenEXR
 
-    if texels.ndim != 3 or texels.shape[2] != 3 or texels.shape[1] != 2 * texels.shape[0]:
-        raise ValueError(f"texels [He, 2 He, 3] are needed, got {texels.shape}")
+    assert texels.shape == (len(texels), 2 * len(texels), 3), texels.shape
     if not bool((np.isfinite(texels) & (texels >= 0.0)).all()):
         raise InputError(where, "the light is negative or not finite", code=ExitCode.NUMERIC)
     planes = {c: texels[..., k].astype(np.float32) for k, c in enumerate("RGB")}
