@@ -6,9 +6,11 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+import warp as wp
 
 from tests.builders.faults import assert_fails, run_case
 from tests.builders.insertions import arguments
@@ -16,6 +18,7 @@ from tests.builders.outcome import outcome
 from warpir.app.program import BROUGHT, EXTRA_OF
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.determinism import fixed_arithmetic
+from warpir.render.device import choose_device
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,6 +41,19 @@ def test_device_that_is_not_there(
     argv = arguments(inputs, "out", device=device)
     lines = assert_fails(argv, 2, "--device", words, cwd=inputs, env=env)
     assert "--device cpu" in lines[1]
+
+
+@pytest.mark.parametrize("name", [None, "cuda", "cuda:0"])
+def test_card_is_too_old_for_warp(monkeypatch: pytest.MonkeyPatch, name: str | None) -> None:
+    """Warp lists a card of before Turing, and refuses it when the first kernel is compiled."""
+    card = SimpleNamespace(alias="cuda:0", name="GeForce GTX 1080", is_cuda=True, arch=61)
+    monkeypatch.setattr(wp, "get_devices", lambda: [card])
+    monkeypatch.setattr(wp, "get_device", lambda alias: card)
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: True)
+    monkeypatch.setattr(wp, "get_cuda_supported_archs", lambda: [75, 80, 90])
+    with pytest.raises(InputError, match=r"GTX 1080.*found sm_61; expected sm_75") as found:
+        choose_device(name)
+    assert found.value.code == ExitCode.USAGE and found.value.advice == "use --device cpu"
 
 
 @pytest.mark.case("R8")

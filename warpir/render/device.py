@@ -85,7 +85,7 @@ def choose_device(name: str | None) -> str:
     """Return the Warp device to use: the one asked for, else CUDA where there is one, else CPU.
 
     Raises:
-        InputError: The device does not exist.
+        InputError: The device does not exist, or is older than those that Warp compiles for.
     """
     start_warp()
     known = [d.alias for d in wp.get_devices()]
@@ -98,7 +98,16 @@ def choose_device(name: str | None) -> str:
             "use --device cpu",
             ExitCode.USAGE,
         )
-    _ = wp.get_device(alias).context  # a card's is made when it is first asked for
+    device, oldest = wp.get_device(alias), min(wp.get_cuda_supported_archs(), default=0)
+    if device.is_cuda and device.arch < oldest:
+        raise InputError(
+            "--device",
+            f"Warp does not compile for {alias}, {device.name}, any more "
+            f"(found sm_{device.arch}; expected sm_{oldest} or newer)",
+            "use --device cpu",
+            ExitCode.USAGE,
+        )
+    _ = device.context  # a card's is made when it is first asked for
     return alias
 
 
