@@ -16,6 +16,7 @@ from tests.builders.faults import assert_fails, run_case
 from tests.builders.insertions import arguments
 from tests.builders.outcome import outcome
 from warpir.app.program import BROUGHT, EXTRA_OF
+from warpir.core.cache import take_notices
 from warpir.core.errors import ExitCode, InputError
 from warpir.render.determinism import fixed_arithmetic
 from warpir.render.device import choose_device
@@ -54,6 +55,23 @@ def test_card_is_too_old_for_warp(monkeypatch: pytest.MonkeyPatch, name: str | N
     with pytest.raises(InputError, match=r"GTX 1080.*found sm_61; expected sm_75") as found:
         choose_device(name)
     assert found.value.code == ExitCode.USAGE and found.value.advice == "use --device cpu"
+
+
+def test_driver_is_too_old_for_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then Warp lists no card; who names none is told why the CPU is used."""
+    cpu = wp.get_device("cpu")
+    monkeypatch.setattr(wp, "get_devices", lambda: [cpu])
+    monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (12, 4))
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: (13, 4))
+    why = "the driver is for CUDA 12.4, Warp needs 13.0 or newer"
+    take_notices()
+    assert choose_device("cpu") == "cpu" and take_notices() == ()
+    assert choose_device(None) == "cpu" and take_notices() == (f"no GPU is used: {why}",)
+    with pytest.raises(InputError, match=why):
+        choose_device("cuda")
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: None)
+    assert choose_device(None) == "cpu" and take_notices() == ()
 
 
 @pytest.mark.case("R8")

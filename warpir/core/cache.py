@@ -60,7 +60,7 @@ def cache_folder(kind: str = "") -> Path:
 
 
 def notice(line: str) -> None:
-    """Remember what the user is to be told about a cache."""
+    """Remember what the user is to be told about a cache, or about the device."""
     if line not in _notices:
         _notices.append(line)
 

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from warpir.core.cache import KernelCache
+from warpir.core.cache import KernelCache, notice
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.memory import core_count
 from warpir.io.images.decoder import captured_stderr
@@ -91,13 +91,16 @@ def choose_device(name: str | None) -> str:
     known = [d.alias for d in wp.get_devices()]
     chosen = ("cuda" if wp.is_cuda_available() else "cpu") if name is None else name
     alias = "cuda:0" if chosen == "cuda" else chosen
+    old = _old_driver()
     if alias not in known:
         raise InputError(
             "--device",
-            f"no device {chosen} here (found {', '.join(known)})",
+            f"no device {chosen} here (found {', '.join(known)}{old and f'; {old}'})",
             "use --device cpu",
             ExitCode.USAGE,
         )
+    if name is None and old:
+        notice(f"no GPU is used: {old}")
     device, oldest = wp.get_device(alias), min(wp.get_cuda_supported_archs(), default=0)
     if device.is_cuda and device.arch < oldest:
         raise InputError(
@@ -109,6 +112,14 @@ def choose_device(name: str | None) -> str:
         )
     _ = device.context  # a card's is made when it is first asked for
     return alias
+
+
+def _old_driver() -> str:
+    """Say that there is a driver which is too old for Warp; nothing where that is not so."""
+    found, built = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    if not found or not built or found[0] >= built[0]:
+        return ""
+    return f"the driver is for CUDA {found[0]}.{found[1]}, Warp needs {built[0]}.0 or newer"
 
 
 def cuda_count() -> int:
