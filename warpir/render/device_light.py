@@ -126,26 +126,39 @@ def _stratified(flux: Float64Array) -> Float64Array:
     return np.asarray(prob)
 
 
-def drawn(
-    launcher: Launcher,
-    light: LightArgs,
-    seed: int,
-    samples: int,
-    normal: Float64Array | None = None,
-) -> LightArgs:
-    """Return the light with a table of drawn directions.
+class PlaneLight:
+    """A light as it is drawn for the one plane that it lights: times the cosine.
+
+    That of the last light is kept, since it takes seconds where a map has thousands of rows.
+
+    Args:
+        normal: Unit normal of the plane, shape [3].
+    """
+
+    def __init__(self, normal: Float64Array) -> None:
+        self.normal = normal
+        self._last: tuple[LightArgs, LightArgs] | None = None
+
+    def of(self, light: LightArgs) -> LightArgs:
+        """Return the light with the plane's proposal in place of its own."""
+        if self._last is None or self._last[0] is not light:
+            self._last = None  # its tables go before others come
+            own: LightArgs = copied(light)
+            propose(own, self.normal)
+            self._last = light, own
+        return self._last[1]
+
+
+def drawn(launcher: Launcher, light: LightArgs, seed: int, samples: int) -> LightArgs:
+    """Return the light with a table of directions that are drawn from its proposal.
 
     Args:
         launcher: Its device.
-        light: From `light_args`.
+        light: From `light_args` or `PlaneLight`.
         seed: Base seed; another one draws other directions.
         samples: How many of them a pixel takes.
-        normal: Unit normal of the one plane that is lit, shape [3]: directions are drawn from the
-            light times the cosine then. None: from the light.
     """
     out: LightArgs = copied(light)
-    if normal is not None:
-        propose(out, normal)
     side = FINE_SIDE if samples >= FINE_FROM else SIDE
     count = side * side
     table = launcher.zeros(count, DrawnLight)

@@ -23,7 +23,7 @@ from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArg
 from warpir.render.allocation import Judged, by_noise, pilot_seed
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels
-from warpir.render.device_light import drawn, plane_radiance
+from warpir.render.device_light import PlaneLight, drawn, plane_radiance
 from warpir.render.device_scene import Scene
 from warpir.render.launches import (
     THROWN_LIMIT,
@@ -123,6 +123,7 @@ class Renderer(Launcher):
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
         self.bad_pixels = BadPixels()
+        self._on_plane = PlaneLight(scene.receiver.normal)
 
     def load_kernels(self, mirrors: bool = False) -> None:
         """Compile or load what a picture of the scene needs, all at once.
@@ -326,7 +327,8 @@ class Renderer(Launcher):
             return ReceiverRadiance(none, none, none)
         view = self.scene.camera_args if camera_args is None else camera_args
         normal = self.scene.receiver.normal if self.scene.receiver.mesh is None else None
-        from_light = drawn(self, light, seed, spp * rays, normal)
+        from_light = light if normal is None else self._on_plane.of(light)
+        from_light = drawn(self, from_light, seed, spp * rays)
         launch = ReceiverLaunch(
             from_light,
             drawn(self, light, seed, spp * rays) if self.bounce_depth else None,

@@ -16,8 +16,10 @@ from tests.builders.shapes import (
     seen_ground,
     sphere,
 )
-from warpir.core.arrays import FloatArray, IntArray
-from warpir.render.device_light import light_args
+from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.kernels.types import LightArgs
+from warpir.render import device_light
+from warpir.render.device_light import light_args, propose
 from warpir.render.device_scene import Receiver, Scene
 from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
@@ -132,6 +134,24 @@ def test_only_wanted_pixels_are_returned_and_others_do_not_change_them(device: s
     some, of_some = picture_ratio(renderer, args, np.zeros(count, np.int32), wanted, QUALITY)
     np.testing.assert_array_equal(some, whole[wanted[whole]])
     np.testing.assert_array_equal(of_some, ratio[wanted[whole]])
+
+
+def test_the_planes_proposal_is_made_once_a_light(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pilot, blocks and pixels draw from it; of a large map it takes seconds each time."""
+    renderer, made = ball(device), list[LightArgs]()
+
+    def counted(args: LightArgs, normal: Float64Array | None = None) -> None:
+        made.extend([] if normal is None else [args])
+        propose(args, normal)
+
+    monkeypatch.setattr(device_light, "propose", counted)
+    first = ratio_everywhere(renderer, sunny())[1]
+    assert len(made) == 1
+    dim = ratio_everywhere(renderer, constant())[1]
+    assert len(made) == 2 and first.shape != dim.shape
+    np.testing.assert_array_equal(ratio_everywhere(renderer, sunny())[1], first)
 
 
 def test_a_mesh_of_the_receiver_is_traced_by_the_pixel(device: str) -> None:
