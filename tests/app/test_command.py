@@ -23,6 +23,7 @@ from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import EXCLUSIVE, OPTIONS, InsertConfig, flag
 from warpir.app.inputs import read_inputs
+from warpir.app.program import say
 from warpir.app.record import PATHS, RUN_FORMAT
 from warpir.app.settings import RenderConfig
 from warpir.core.errors import ExitCode, InputError, raise_all
@@ -877,6 +878,14 @@ def test_main_survives_a_closed_stdout(scene: list[str], tmp_path: Path) -> None
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_line_is_written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads print too: with its end written apart, two lines ran into one."""
+    written = []
+    monkeypatch.setattr(sys.stdout, "write", written.append)
+    say("one")
+    assert [text for text in written if text] == ["one\n"]
 
 
 def test_insert_is_called_through_the_module() -> None:

@@ -252,7 +252,7 @@ def _one_line(text: str) -> str:
 def say(line: str) -> None:
     """Print on standard output; a reader that went away, or a full disk, does not end the run."""
     try:
-        print(_one_line(line), flush=True)
+        print(f"{_one_line(line)}\n", end="", flush=True)  # one write: threads print too
     except OSError:
         # Python flushes once more at exit: give it somewhere to write to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
