@@ -497,6 +497,9 @@ def test_C6_gltf_camera_is_named_before_it_is_counted(
     np.testing.assert_array_equal(read_photo_camera(path, SIZE, frame="0").camera.c2w, poses["1"])
     with pytest.raises(InputError, match="no one"):
         read_photo_camera(path, SIZE, frame="9" * 5000)
+    content["nodes"][1]["name"] = "None"
+    with pytest.raises(InputError, match="which camera"):
+        read_photo_camera(write_glb(path, content), SIZE, frame=None)
 
 
 @pytest.mark.case("C2")

@@ -36,11 +36,11 @@ def read_gltf_camera(
         for k, (node, camera) in enumerate(zip(placed, cameras, strict=True))
     ]
     of_nodes = [node.text("name", "") for node in placed]
-    is_number = frame is not None and frame.isdecimal() and len(frame) < 10
-    if frame not in names and of_nodes.count(str(frame)) == 1:
-        k = of_nodes.index(str(frame))
-    elif frame not in names and is_number and int(str(frame)) < len(placed):
-        k = int(str(frame))  # names come first: some exporters number their cameras from 1
+    other = "" if frame is None or frame in names else frame
+    if other and of_nodes.count(other) == 1:
+        k = of_nodes.index(other)
+    elif other.isdecimal() and len(other) < 10 and int(other) < len(placed):
+        k = int(other)  # names come first: some exporters number their cameras from 1
     else:
         k = choose_frame(path, names, frame, None, noun="camera")
     entry = cameras[k]
