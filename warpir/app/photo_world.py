@@ -47,9 +47,9 @@ WIDE = {"pitch_deg": 8.0, "roll_deg": 5.0, "vfov_deg": 18.0}
 """Standard deviation above which an estimate is doubtful [deg]."""
 WORDS = {"pitch_deg": "pitch", "roll_deg": "roll", "vfov_deg": "vertical field of view"}
 """What the numbers are called where they are printed."""
-SEEN = (0.04, 1.0)
-"""Longest side of an object that was given no size, over the photo's height, within which it keeps
-its own where it is whole: smaller ones are hardly seen, larger ones fill the photo."""
+SEEN = 0.04
+"""Longest side of an object that was given no size, over the photo's height, from which it keeps
+its own where it is whole: smaller ones are hardly seen."""
 SHOWN = 0.25
 """The same where it does not."""
 LOOKING_DOWN = -30.0
@@ -358,7 +358,7 @@ def stand_on_ground(
         if world.cloud is not None and (count := len(stand.points_in_way(world.cloud))):
             warning = f"{count} points of --ground-points stand where the object does; is it free?"
             placement = replace(placement, warnings=(*placement.warnings, warning))
-        if not is_sized and stand.share_of_height < SEEN[0]:
+        if not is_sized and stand.share_of_height < SEEN:
             pixels = stand.share_of_height * world.camera.height
             metres = float((high - low).max())
             warning = f"with its own {metres:.3g} m the object is {pixels:.2g} pixels long (--size)"
@@ -404,7 +404,8 @@ def _set_free(
                 return usual
     eye = world.camera.c2w[:3, 3]
     plane = upright_plane(world.ground, eye)
-    own, seen, lines = float((high - low).max()), math.inf, []
+    own, keeps_size = float((high - low).max()), is_sized
+    lines = []
     try:
         place = find_place(stand, world.camera, plane, world.cloud)
     except InputError:
@@ -415,9 +416,8 @@ def _set_free(
     else:
         placement = put(place)
         away = float(np.linalg.norm(np.subtract(place, eye)))
-        if not stand(place).is_cut:
-            seen = stand(place).share_of_height
-    if not is_sized and not SEEN[0] <= seen <= SEEN[1]:
+        keeps_size |= not stand(place).is_cut and stand(place).share_of_height >= SEEN
+    if not keeps_size:
         away = min(away, _usual_distance(world.camera, plane))
         size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
         place = find_place(lambda there: stand(there, size), world.camera, plane, world.cloud)
