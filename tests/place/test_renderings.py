@@ -178,7 +178,8 @@ def test_what_is_rendered_already_is_told(inputs: Path, tmp_path: Path) -> None:
         page.route("**/preview", lambda route: route.fulfill(status=422, json=refusal))
         said |= {"state": "running", "kind": "preview"}
         page.click("#preview")
-        page.wait_for_selector("#cancel:not([hidden])")
+        # Not Cancel, which is there before the refusal comes, too.
+        page.wait_for_selector("#rendering-words:has-text('Estimating the light')")
         said |= {"state": "done", "address": "photo.jpg"}
         page.wait_for_selector("#cancel", state="hidden")
         assert page.locator("#picture").is_hidden()
