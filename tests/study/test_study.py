@@ -939,6 +939,7 @@ def answer_all(opened: Opened, count: int) -> None:
             use_fingers(opened)
         if number == 2:
             for _ in range(2):
+                page.evaluate("sessionStorage.clear()")  # as Chromium has it for some reloads
                 page.reload()
                 await_pair(opened, number)
         if number % 2:
@@ -982,6 +983,7 @@ def test_a_study_from_consent_to_figures(
         opened.page.get_by_role("button", name="Stop and discard").click()
         assert opened.page.is_visible("#stopped")
         assert opened.page.evaluate("sessionStorage.length") == 0
+        assert opened.page.evaluate("history.state") is None
         opened.page.reload()
         begin(opened)
         opened.page.get_by_role("button", name="Photo without the object").click()

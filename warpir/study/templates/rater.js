@@ -11,7 +11,9 @@ const deafMs = 400;
 const place = `study-${sheet.study}-${sheet.rater}`;
 let state = { answers: [], resumed: 0, begun: false };
 try {
-  const kept = JSON.parse(sessionStorage.getItem(place));
+  // Chromium has no storage for one reload in a hundred on a busy machine; the history it keeps.
+  const { of, held } = history.state ?? {};
+  const kept = of === place ? held : JSON.parse(sessionStorage.getItem(place));
   if (kept) {
     state = { ...kept, resumed: kept.resumed + 1 };
     remember(); // now: it may be loaded once more before anything is chosen
@@ -19,9 +21,11 @@ try {
 } catch { /* storage is switched off: a page that is loaded again begins anew */ }
 
 function remember() {
+  history.replaceState({ of: place, held: state }, "");
   try { sessionStorage.setItem(place, JSON.stringify(state)); } catch { /* as above */ }
 }
 function forget() {
+  history.replaceState(null, "");
   try { sessionStorage.removeItem(place); } catch { /* as above */ }
 }
 
