@@ -122,7 +122,7 @@ def believed(level: float, photo: Photo) -> float:
     """Return a level of the ground as far as a photo can show it [1]; a linear plate shows all."""
     low, high = LEVELS
     if photo.is_linear:
-        return max(level, low / photo.exposed()[1])
+        return max(level, low / photo.exposure)
     return min(max(level, low), high)
 
 

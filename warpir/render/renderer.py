@@ -325,7 +325,6 @@ class Renderer(Launcher):
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)
             return ReceiverRadiance(none, none, none)
-        view = self.scene.camera_args if camera_args is None else camera_args
         normal = self.scene.receiver.normal if self.scene.receiver.mesh is None else None
         from_light = light if normal is None else self._on_plane.of(light)
         from_light = drawn(self, from_light, seed, spp * rays)
@@ -333,7 +332,7 @@ class Renderer(Launcher):
             from_light,
             drawn(self, light, seed, spp * rays) if self.bounce_depth else None,
             None if normal is None or is_recorded else plane_radiance(self, from_light, normal),
-            view,
+            self.scene.camera_args if camera_args is None else camera_args,
             rays,
             seed,
             self.bounce_depth,

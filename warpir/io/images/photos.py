@@ -5,6 +5,7 @@ error flag (`warpir.io.images.decoder`), orientation, colour (`warpir.io.images.
 alpha. Nothing behind this border checks again. What is written is in `warpir.io.results`.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,14 @@ class Photo:
         """Whether the codes have more than 8 bits, so that half floats would lose some."""
         return self.codes.dtype.itemsize > 1
 
+    @property
+    def exposure(self) -> float:
+        """Factor on radiance with which the estimators see a linear plate; 1 of a photograph."""
+        if not self.is_linear:
+            return 1.0
+        step = math.ceil(math.sqrt(self.codes.size / EXPOSED_BY))
+        return float(2.0 ** color.expose(self.codes[::step, ::step])[1])
+
     def exposed(self) -> tuple[FloatArray, float]:
         """Return what the estimators look at, and by what its light is to be divided.
 
@@ -71,8 +80,8 @@ class Photo:
         """
         if not self.is_linear:
             return self.srgb, 1.0
-        exposed, stops = color.expose(self.codes)
-        return exposed, 2.0**stops
+        alpha = np.float32(self.exposure ** (1.0 / color.GAMMA))
+        return np.clip(alpha * color.linear_to_gamma(self.codes), 0.0, 1.0), self.exposure
 
     def linear(self, where: Any = ...) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
@@ -117,6 +126,8 @@ class Photo:
         return codes
 
 
+EXPOSED_BY = 3e6
+"""Number of values, evenly in the picture, that the exposure of a larger plate goes by."""
 EVEN = 0.016
 """How far the values of a border may differ, as JPEG makes them, over the largest code [1]."""
 LABELS = 0.05
