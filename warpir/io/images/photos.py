@@ -80,8 +80,9 @@ class Photo:
         """
         if not self.is_linear:
             return self.srgb, 1.0
-        alpha = np.float32(self.exposure ** (1.0 / color.GAMMA))
-        return np.clip(alpha * color.linear_to_gamma(self.codes), 0.0, 1.0), self.exposure
+        factor = self.exposure
+        alpha = np.float32(factor ** (1.0 / color.GAMMA))
+        return np.clip(alpha * color.linear_to_gamma(self.codes), 0.0, 1.0), factor
 
     def linear(self, where: Any = ...) -> FloatArray:
         """Return ``photo_lin`` [1], shape [H, W, 3]: ``srgb ** 2.2``, or a plate's own values.
