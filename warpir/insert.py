@@ -115,24 +115,22 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 device = pool.submit(choose_device, run.config.render.device)
 
                 from warpir.optimize.find_light import find_light, with_photo_detail
-                from warpir.report.result import look_of, render_result, write_preview
+                from warpir.report.result import look_of, place_result, render_result, write_preview
 
             run = run.on_device(device.result()).with_ground_coat()
         run.take_cache_notices()
         lit = find_light(run, given)
         with sparing():
-            has_preview = given is None and not run.config.is_guided
             with no_collection(), ThreadPoolExecutor(2) as pool:
-                # On the host the preview has all cores, and comes first.
-                if has_preview and run.device == "cpu":
+                # On a card the picture itself comes as soon. The preview has all cores.
+                if given is None and not run.config.is_guided and run.device == "cpu":
                     write_preview(lit.run, lit.light)
                 detailed = pool.submit(with_photo_detail, lit)
                 look = pool.submit(look_of, lit.run, lit.light)
-                if has_preview and run.device != "cpu":
-                    write_preview(lit.run, lit.light)
                 with run.timings.stage("scene"):
+                    placed = place_result(lit.run, lit.light)
                     lit, seen = detailed.result(), look.result()
-            rendered = render_result(lit.run, lit.light, seen)
+            rendered = render_result(lit.run, lit.light, seen, placed)
             record = _write(lit, rendered, config)
     say(summary_line(record))
     record = read_json_object(output.path / "run.json")

@@ -22,6 +22,7 @@ from warpir.lighting.scene_light import SceneLight
 from warpir.look.camera_look import CameraLook, estimate_look, look_of_preview, region_around
 from warpir.look.denoise import denoiser_version
 from warpir.render.composite import Picture, make_picture
+from warpir.render.device_scene import Scene
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.photo_scene import scene_of
 from warpir.render.picture.quality import Quality
@@ -59,15 +60,18 @@ class RenderedResult:
     """Samples, triangles, bad pixels and repeated launches, for ``run.json``."""
 
 
-def render_result(run: Run, light: SceneLight, look: CameraLook) -> RenderedResult:
+def place_result(run: Run, light: SceneLight) -> Scene:
+    """Put the object into the scene that `render_result` renders."""
+    camera = _rendering_camera(run.inputs.camera, run.config.render.width)
+    return run.memory.again(
+        lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
+    )
+
+
+def render_result(run: Run, light: SceneLight, look: CameraLook, placed: Scene) -> RenderedResult:
     """Render object and shadow, and composite them into the photo with the camera's look."""
-    with run.timings.stage("scene"):
-        camera = _rendering_camera(run.inputs.camera, run.config.render.width)
-        placed = run.memory.again(
-            lambda: scene_of(run.inputs, camera, run.device, light.curves), "the scene", "--asset"
-        )
     with run.timings.stage("render"), progress_bar(run.log.say) as report:
-        quality = run.config.render
+        quality, camera = run.config.render, placed.camera
         renderer = Renderer(
             placed, quality.threads or 0, report, run.memory, bounce_depth=quality.bounce_depth
         )
