@@ -25,6 +25,7 @@ from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.picture import BEND, picture_ratio
 from warpir.render.shadow.pilot import run_pilot
+from warpir.scene.asset import Material
 from warpir.scene.light import Light
 from warpir.scene.receiver import mesh_of
 
@@ -173,3 +174,24 @@ def test_the_pilot_knows_the_open_planes_radiance(device: str) -> None:
     renderer = ball(device)
     pilot = run_pilot(renderer, light_args(constant((0.5, 1.0, 2.0)), renderer.device), 0)
     np.testing.assert_allclose(pilot.open_radiance, [0.5, 1.0, 2.0], rtol=2e-3)
+
+
+def test_what_a_mirror_throws_is_the_same_share_of_dark_ground(device: str) -> None:
+    """The limit of specks follows the ground's own light: a photo may be dark."""
+    mirror = placed(sphere((0.0, RADIUS, 0.0), RADIUS, detail=4), Material(roughness=0.05))
+    renderer = Renderer(Scene([mirror], VIEW, ground(0.0), device), bounce_depth=2)
+    quality = replace(QUALITY, indirect_limit=8.0)
+    sky = np.full((8, 16, 3), 0.5, np.float32)
+    sun = lobe((0.5, 0.6, 0.4), 3000.0, (400.0, 400.0, 400.0)).lobes
+    assert sun is not None
+    at = [
+        ratio_everywhere(
+            renderer,
+            Light(replace(sun, amplitude=sun.amplitude * level), sky * np.float32(level)),
+            quality,
+        )[1]
+        for level in (1.0, 1.0 / 64.0)
+    ]
+    bright, dark = at
+    assert bright.max() > 1.0
+    np.testing.assert_allclose(dark, bright, rtol=1e-3)

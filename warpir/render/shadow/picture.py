@@ -12,6 +12,7 @@ noise included, the ratio comes from `Renderer.receiver`; so does all of it near
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,7 +44,8 @@ def picture_ratio(
         light: From `light_args`.
         may_see_object: 1 where the object may hide the receiver, row-major, shape [H * W].
         wanted: Pixels to return at most, shape [H * W].
-        quality: Counts and seed.
+        quality: Counts and seed; its limit is of what is thrown onto ground of radiance 1 or more,
+            and of darker ground a share.
 
     Returns:
         Row-major pixels, shape [receiver_pixel], and ratios, shape [receiver_pixel, 3].
@@ -51,6 +53,9 @@ def picture_ratio(
     camera = renderer.scene.camera
     pilot = run_pilot(renderer, light, quality.seed, quality.indirect_limit)
     pixels = np.flatnonzero(wanted & pilot.pixels_of(pilot.changes, camera)).astype(np.int32)
+    # A speck shows beside the ground's own light, which in a dark photo is little.
+    limit = quality.indirect_limit * min(1.0, float(pilot.open_radiance.max()))
+    quality = replace(quality, indirect_limit=limit)
     gains = pilot.pixels_of(pilot.gains, camera)[pixels]
     ratio = np.ones((len(pixels), 3), np.float32)
     bends, gain_bends = np.ones(len(pixels), np.bool_), gains
