@@ -212,14 +212,15 @@ def test_M14_concave_polygons_of_too_many_corners(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M20")
-def test_M20_vertex_colors_are_linear_and_noted(tmp_path: Path) -> None:
-    """``v x y z r g b`` gives linear colours on white."""
+def test_M20_vertex_colors_are_decoded_and_noted(tmp_path: Path) -> None:
+    """``v x y z r g b`` is sRGB, as Blender and three.js have it, and becomes linear on white."""
     text = SQUARE.replace("v 1 1 0", "v 1 1 0 0.5 0.25 1") + FACES
     asset = load_asset(write(tmp_path, text))
     colors = asset.primitives[0].colors
-    np.testing.assert_array_equal(colors, [[1, 1, 1, 1]] * 2 + [[0.5, 0.25, 1, 1], [1, 1, 1, 1]])
+    linear = [0.2140411, 0.0508761, 1, 1]
+    np.testing.assert_allclose(colors, [[1, 1, 1, 1]] * 2 + [linear, [1, 1, 1, 1]], rtol=1e-6)
     assert asset.materials[0].base_color == (1.0, 1.0, 1.0)
-    assert any("linear" in notice for notice in asset.notices)
+    assert any("sRGB" in notice for notice in asset.notices)
 
 
 @pytest.mark.case("M20")
@@ -228,7 +229,7 @@ def test_M20_vertex_colors_of_8_bits(tmp_path: Path) -> None:
     text = SQUARE.replace("v 1 1 0", "v 1 1 0 255 102 0") + FACES
     asset = load_asset(write(tmp_path, text))
     assert asset.primitives[0].colors is not None
-    np.testing.assert_allclose(asset.primitives[0].colors[2], [1, 0.4, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(asset.primitives[0].colors[2], [1, 0.1328683, 0, 1], atol=1e-6)
     assert any("divided" in notice for notice in asset.notices)
     np.testing.assert_array_equal(asset.primitives[0].colors[1], [1, 1, 1, 1])
     asset = load_asset(write(tmp_path, text.replace("102", "0.4")))
@@ -551,12 +552,13 @@ def test_ply_polygons_keep_their_area(kind: str, case: str, tmp_path: Path) -> N
 def test_ply_colors_keep_their_precision(
     kind: str, extra: str, values: tuple[float, ...], expected: tuple[float, ...], tmp_path: Path
 ) -> None:
-    """Vertex colours of every type become linear RGBA, not rounded to 8 bits."""
+    """Vertex colours of every type, sRGB, become linear RGBA, not rounded to 8 bits."""
     vertices = [(*corner, *values) for corner in ((0, 0, 0), (1, 0, 0), (1, 1, 0))]
     content = ply_text(kind, vertices, [(0, 1, 2)], extra)
     colors = load_asset(write(tmp_path, content, "asset.ply")).primitives[0].colors
     assert colors is not None
-    np.testing.assert_allclose(colors, [expected] * 3, rtol=1e-6)
+    linear = [x / 12.92 if x < 0.04 else ((x + 0.055) / 1.055) ** 2.4 for x in expected[:3]]
+    np.testing.assert_allclose(colors, [(*linear, expected[3])] * 3, rtol=1e-6)
 
 
 def test_ply_says_what_it_does_not_read(tmp_path: Path) -> None:
@@ -633,7 +635,7 @@ def test_ply_square(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(area(asset), [[0, 0, 0.5]] * 2)
     np.testing.assert_array_equal(square.normals, [[0, 0, 1]] * 4)
     assert square.colors is not None
-    np.testing.assert_allclose(square.colors[0], [0.2, 0.4, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(square.colors[0], [0.0331048, 0.1328683, 1, 1], rtol=2e-6)
     assert asset.materials[0].double_sided
     assert any("size 1 x 1 x 0" in notice for notice in asset.notices)
 

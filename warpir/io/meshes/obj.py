@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, Int64Array, IntArray
+from warpir.core.color import srgb_to_linear
 from warpir.core.errors import Faults, InputError
 from warpir.core.limits import Limits
 from warpir.io.meshes.asset_files import concise, read_regular
@@ -236,12 +237,12 @@ def _vertex_colors(
 ) -> FloatArray | None:
     """Return the colours after the positions (``v x y z r g b``), linear RGBA, shape [position, 4].
 
-    Whole numbers up to 255 are codes of 8 bits; positions without a colour are white, and where
-    none has one it is None.
+    Exporters write them in sRGB. Whole numbers up to 255 are codes of 8 bits; positions without a
+    colour are white, and where none has one it is None.
     """
     if not stated:
         return None
-    notices.append("vertex colours read as linear Rec.709")
+    notices.append("vertex colours read as sRGB")
     values = np.array(list(stated.values()))
     if 1.0 < values.max() <= 255.0 and (values == np.round(values)).all():
         notices.append("vertex colours up to 255 divided by that")
@@ -249,7 +250,7 @@ def _vertex_colors(
     elif values.min() < 0.0 or values.max() > 1.0:
         notices.append("vertex colours clamped to 0 ... 1")
     colors = np.ones((count, 4), dtype=np.float32)
-    colors[list(stated), :3] = np.clip(values, 0.0, 1.0)
+    colors[list(stated), :3] = srgb_to_linear(np.clip(values, 0.0, 1.0))
     return colors
 
 

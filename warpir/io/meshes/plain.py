@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
+from warpir.core.color import srgb_to_linear
 from warpir.core.limits import Limits
 from warpir.io.meshes.asset_files import GREY, concise, plain_material, read_regular
 from warpir.io.meshes.ply import PLY, Element, Lists, read_ply
@@ -93,7 +94,7 @@ def _asset(
         notices.append("no material: grey 0.8, roughness 0.5")
     else:
         material = plain_material("vertex colours", (1.0, 1.0, 1.0))
-        notices.append("vertex colours read as linear Rec.709")
+        notices.append("vertex colours read as sRGB")
         notices.append("no material: roughness 0.5")
     primitives = []
     if len(indices):
@@ -133,7 +134,7 @@ def _finite(path: Path, element: Element, names: tuple[str, ...]) -> Float64Arra
 def _colors(path: Path, vertex: Element) -> FloatArray | None:
     """Return the vertex colours of a PLY file, linear RGBA, shape [vertex, 4].
 
-    Integers count up to their largest value, floats to 1.
+    Exporters write them in sRGB; integers count up to their largest value, floats to 1.
     """
     for prefix in ("", "diffuse_"):
         names = (f"{prefix}red", f"{prefix}green", f"{prefix}blue")
@@ -147,5 +148,6 @@ def _colors(path: Path, vertex: Element) -> FloatArray | None:
         if not ((colors >= 0.0) & (colors <= 1.0)).all():
             found = f"{colors.min():g} to {colors.max():g}"
             raise PLY.error(path, "color", found=found)
+        colors[:, :3] = srgb_to_linear(colors[:, :3])
         return colors.astype(np.float32)
     return None
