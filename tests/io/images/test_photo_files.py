@@ -110,6 +110,51 @@ def test_focal_length_of_exif(tmp_path: Path, rng: np.random.Generator) -> None:
     assert read_photo(tmp_path / "q.jpg").focal_35mm is None
 
 
+@pytest.mark.parametrize(
+    ("size", "stated", "holds"),
+    [((40, 30), (4032, 3024), True), ((30, 40), (4032, 3024), True), ((40, 30), (40, 30), True),
+     ((30, 30), (4032, 3024), False), ((40, 22), (4032, 3024), False), ((40, 30), (0, 0), True)],
+)  # fmt: skip
+def test_focal_length_is_of_the_whole_picture(
+    size: tuple[int, int],
+    stated: tuple[int, int],
+    holds: bool,
+    tmp_path: Path,
+    rng: np.random.Generator,
+) -> None:
+    """A picture of another shape than EXIF's was cropped: its focal length holds no longer."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0xA405: 28, 0xA002: stated[0], 0xA003: stated[1]})
+    Image.fromarray(codes8(rng)).resize(size).save(tmp_path / "p.jpg", exif=exif)
+    photo = read_photo(tmp_path / "p.jpg")
+    assert photo.focal_35mm == (28.0 if holds else None)
+    assert any("cropped" in notice for notice in photo.notices) != holds
+
+
+@pytest.mark.parametrize("told_by", ["XMP", "EXIF"])
+def test_panorama_has_no_focal_length(
+    told_by: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """What was joined from many views is no pinhole's picture; as a light it is one as it is."""
+    exif, told = Image.Exif(), {}
+    exif.get_ifd(0x8769)[0xA405] = 26
+    if told_by == "EXIF":
+        exif.get_ifd(0x8769)[0xA401] = 6
+    else:
+        told["xmp"] = (
+            b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/'
+            b'22-rdf-syntax-ns#"><rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/'
+            b'panorama/" GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+        )
+    Image.fromarray(codes8(rng)).resize((64, 32)).save(tmp_path / "p.jpg", exif=exif, **told)
+    photo = read_photo(tmp_path / "p.jpg")
+    assert photo.focal_35mm is None
+    assert any("panorama" in notice for notice in photo.notices)
+    notices: list[str] = []
+    read_envmap(tmp_path / "p.jpg", pictures=True, notices=notices)
+    assert not any("panorama" in notice for notice in notices)
+
+
 @pytest.mark.parametrize("mode", ["L", "1", "P", "LA"], ids="I9-{}".format)
 def test_other_layouts_are_expanded(tmp_path: Path, rng: np.random.Generator, mode: str) -> None:
     picture = Image.fromarray(codes8(rng)).convert(mode)

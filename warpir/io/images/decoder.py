@@ -22,7 +22,7 @@ import numpy as np
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS
-from warpir.io.images.headers import exposure, header_notices, stated_primaries
+from warpir.io.images.headers import exposure, header_notices, stated_primaries, view_of
 from warpir.io.images.kinds import KINDS, check_regular_file, check_scans, sniff
 from warpir.io.images.tiff import check_tiff, tiff_codes
 
@@ -44,6 +44,8 @@ class DecodedImage:
     primaries: tuple[float, ...] | None
     """Chromaticities of a float image that are not Rec.709: xy of red, green, blue and white."""
     focal_35mm: float | None
+    about_view: tuple[str, ...]
+    """What matters only where it is a photograph taken with one lens."""
     notices: tuple[str, ...]
 
     @property
@@ -99,6 +101,7 @@ def decode_image(
     if pixels.dtype.kind == "f":
         primaries, unknown = stated_primaries(spec, kind, head)
         notices += unknown
+    focal, about_view = view_of(spec)
     return DecodedImage(
         pixels=_some_channels(pixels, [channel - first for channel in channels]),
         alpha=pixels[..., alpha - first] if alpha is not None else None,
@@ -106,7 +109,8 @@ def decode_image(
         orientation=spec.get_int_attribute("Orientation", 1),
         icc=_profile(spec),
         primaries=primaries,
-        focal_35mm=_focal_35mm(spec),
+        focal_35mm=focal,
+        about_view=tuple(about_view),
         notices=tuple(notices),
     )
 
@@ -293,12 +297,6 @@ def _profile(spec: Any) -> bytes | None:
     profile = spec.getattribute("ICCProfile")
     # An EXR may call anything so.
     return bytes(profile) if isinstance(profile, bytes | np.ndarray) else None
-
-
-def _focal_35mm(spec: Any) -> float | None:
-    # A tag of another type than it should have comes back as the default.
-    focal = float(spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0))
-    return focal if 1.0 <= focal <= 10000.0 else None
 
 
 def _check_spec(path: Path, spec: Any) -> None:

@@ -94,3 +94,30 @@ def header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     ):
         notices.append("palette expanded to RGB")
     return notices
+
+
+_SAME_SHAPE = 0.02
+"""How far a picture's shape may be from that which its EXIF states."""
+_PANORAMA = 6
+"""EXIF's CustomRendered, as Apple writes it."""
+
+
+def view_of(spec: Any) -> tuple[float | None, list[str]]:
+    """Return EXIF's 35 mm equivalent focal length [mm] where it holds, and what does not hold."""
+    panorama = spec.get_int_attribute("Exif:CustomRendered", 0) == _PANORAMA
+    if panorama or spec.getattribute("GPano:ProjectionType"):
+        return None, [
+            "a panorama, not what one lens sees: camera, place and light will be wrong; cut a "
+            "plain view out of it"
+        ]
+    # A tag of another type than it should have comes back as the default.
+    focal = float(spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0))
+    if not 1.0 <= focal <= 10000.0:
+        return None, []
+    short, long = sorted(spec.get_int_attribute(f"Exif:Pixel{k}Dimension", 0) for k in "XY")
+    least, most = sorted((spec.width, spec.height))  # some programs turn the picture, not the tags
+    if short > 0 and abs(most * short / long - least) > max(1.0, _SAME_SHAPE * least):
+        return None, [
+            f"cropped since its EXIF was written ({long} x {short}): its focal length is not used"
+        ]
+    return focal, []

@@ -158,7 +158,7 @@ def read_photo(
     """
     path = Path(path)
     image = decode_image(path, max_pixels, layer=layer)
-    notices = list(image.notices)
+    notices = [*image.notices, *image.about_view]
     if _is_transparent(image):
         if alpha != "ignore":
             what = "partly transparent (found an alpha channel; expected an opaque photograph)"
