@@ -1103,10 +1103,14 @@ def test_G11_glass_bodies_are_looked_at() -> None:
     assert glass_notices([inward], [replace(solid, thickness=0.0)]) == []
 
 
-def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:
-    """Specular-glossiness without a fallback becomes a dielectric whose F0 is its specular colour.
+@pytest.mark.parametrize("fallback", [None, {}, {"baseColorFactor": [1, 0, 0, 1]}])
+def test_G11_specular_glossiness_is_converted(
+    tmp_path: Path, fallback: dict[str, Any] | None
+) -> None:
+    """Specular-glossiness becomes a dielectric whose F0 is its specular colour.
 
-    The texture's alpha is glossiness; roughness is what the factor times it leaves to 1.
+    It goes before a metallic fallback, as its specification asks. The texture's alpha is
+    glossiness; roughness is what the factor times it leaves to 1.
     """
     builder = Builder()
     builder.base_color()
@@ -1117,6 +1121,8 @@ def test_G11_specular_glossiness_is_converted(tmp_path: Path) -> None:
     builder.json["materials"][0] = {
         "extensions": {"KHR_materials_pbrSpecularGlossiness": extension}
     }
+    if fallback is not None:
+        builder.json["materials"][0]["pbrMetallicRoughness"] = fallback
     (material,) = load(tmp_path, builder).materials
     assert material.base_color == (0.5, 0.25, 0.125)
     assert (material.metallic, material.roughness, material.ior) == (0.0, 0.25, 0.0)

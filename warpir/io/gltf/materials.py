@@ -176,7 +176,7 @@ class MaterialReader:
             self.notices.append(f"material {material.name!r}: unlit, shown as a lit matte surface")
         else:
             glossiness = entry.extension("KHR_materials_pbrSpecularGlossiness")
-            if glossiness is not None and "pbrMetallicRoughness" not in entry:
+            if glossiness is not None:  # goes before a metallic fallback
                 material = self._from_glossiness(material, glossiness)
             else:
                 material = self._add_reflection(material, entry)
