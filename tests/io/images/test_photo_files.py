@@ -883,6 +883,46 @@ def test_what_a_jpeg_says_is_noted(
     assert any(words in notice for notice in photo.notices)
 
 
+def test_gain_map_is_not_applied(tmp_path: Path) -> None:
+    """An Ultra HDR picture, as Android writes it, is its base image, with its EXIF and orientation.
+
+    OpenImageIO would multiply it by up to 4 and give half floats.
+    """
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif.get_ifd(0x8769)[0xA405] = 24
+    codes = np.zeros((32, 48, 3), np.uint8)
+    codes[:, :24], codes[:, 24:] = (200, 60, 40), (60, 90, 180)
+    gain = io.BytesIO()
+    about = "hdrgm:Version='1.0' hdrgm:GainMapMax='2' hdrgm:HDRCapacityMax='2'"
+    Image.new("L", (24, 16), 255).save(gain, "JPEG", xmp=gain_map_xmp(about))
+    item = (
+        "<rdf:li rdf:parseType='Resource'><Container:Item Item:Mime='image/jpeg' Item:{}/></rdf:li>"
+    )
+    listed = item.format("Item:Semantic='Primary'")
+    listed += item.format(f"Item:Semantic='GainMap' Item:Length='{len(gain.getvalue())}'")
+    listed = f"<Container:Directory><rdf:Seq>{listed}</rdf:Seq></Container:Directory>"
+    xmp = gain_map_xmp("hdrgm:Version='1.0'", listed)
+    path = tmp_path / "p.jpg"
+    Image.fromarray(codes).save(path, quality=95, subsampling=0, exif=exif, xmp=xmp)
+    path.write_bytes(path.read_bytes() + gain.getvalue())
+    photo = read_photo(path)
+    assert photo.codes.dtype == np.uint8 and photo.focal_35mm == 24.0
+    np.testing.assert_allclose(photo.codes, np.rot90(codes, -1), atol=4)
+    assert any("gain map" in notice for notice in photo.notices)
+
+
+def gain_map_xmp(attributes: str, content: str = "") -> bytes:
+    """Return XMP in the namespaces of Ultra HDR."""
+    google = "http://ns.google.com/photos/1.0/container/"
+    return (
+        "<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:RDF xmlns:rdf='http://www.w3.org/1999/02/22-rdf-"
+        "syntax-ns#'><rdf:Description xmlns:hdrgm='http://ns.adobe.com/hdr-gain-map/1.0/' "
+        f"xmlns:Container='{google}' xmlns:Item='{google}item/' {attributes}>{content}"
+        "</rdf:Description></rdf:RDF></x:xmpmeta>"
+    ).encode()
+
+
 @pytest.mark.parametrize("case", ["I9-LAB", "I9-uint16-1-bit", "I9-CMYK", "I9-P", "I9-planar"])
 def test_tiff_layouts(tmp_path: Path, rng: np.random.Generator, case: str) -> None:
     path, codes = tmp_path / "p.tif", codes8(rng)

@@ -22,7 +22,13 @@ import numpy as np
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS
-from warpir.io.images.headers import exposure, header_notices, stated_primaries, view_of
+from warpir.io.images.headers import (
+    exposure,
+    header_notices,
+    stated_primaries,
+    view_of,
+    without_gain_map,
+)
 from warpir.io.images.kinds import KINDS, check_regular_file, check_scans, sniff
 from warpir.io.images.tiff import check_tiff, tiff_codes
 
@@ -243,8 +249,8 @@ def _opened(
     spec = oiio.ImageSpec()
     for name, value in (hints or {}).items():
         spec.attribute(name, value)
-    with captured_stderr():
-        reader = oiio.ImageInput.open(str(file.path), spec)
+    with captured_stderr(), without_gain_map(file.path, file.kind) as path:
+        reader = oiio.ImageInput.open(str(path), spec)
         if reader is None:
             raise file.unreadable(library_error(oiio))
         try:

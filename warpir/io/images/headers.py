@@ -1,7 +1,9 @@
 """What the header of an image says about its colours, and what of it is not followed."""
 
 import re
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +65,27 @@ def stated_primaries(
 
 
 _GAIN_MAPS = (b"hdrgm:", b"hdr-gain-map", b"hdrgainmap", b"urn:iso:std:iso:ts:21496")
+_ULTRA_HDR = b"hdrgm:Version"
+"""Sign in a JPEG's XMP by which OpenImageIO knows an Ultra HDR picture."""
 _PNG_PALETTE = 3
 """Colour type in a PNG's IHDR, byte 25 of the file."""
+
+
+@contextmanager
+def without_gain_map(path: Path, kind: str) -> Iterator[Path]:
+    """Yield a file in which OpenImageIO finds no gain map: the same, or a copy for that time.
+
+    Its half floats of an Ultra HDR picture are display light up to several times white; the photo
+    that people see, and all other programs open, is the base image.
+    """
+    content = path.read_bytes() if kind == "jpeg" else b""
+    if _ULTRA_HDR not in content:
+        yield path
+        return
+    with tempfile.NamedTemporaryFile(prefix="warpir-", suffix=".jpg") as copy:
+        copy.write(content.replace(_ULTRA_HDR, _ULTRA_HDR.replace(b":", b"_")))
+        copy.flush()
+        yield Path(copy.name)
 
 
 def header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
