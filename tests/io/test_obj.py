@@ -328,6 +328,15 @@ def test_mtl_roughness_from_the_exponent(tmp_path: Path) -> None:
     assert any("roughness 0.5 assumed" in notice for notice in asset.notices)
 
 
+def test_M20_tr_1_alone_is_opaque(tmp_path: Path) -> None:
+    """MeshLab and scanners write Tr 1 for opaque; beside a d it says nothing."""
+    asset = with_mtl(tmp_path, "Kd 1 1 1\nTr 1.000000\nillum 2\nNs 0.000000\n")
+    (material,) = asset.materials
+    assert (material.alpha, material.alpha_mode) == (1.0, "OPAQUE")
+    assert any("Tr 1 without d" in notice for notice in asset.notices)
+    assert with_mtl(tmp_path, "Kd 1 1 1\nTr 1\nd 0.5\n").materials[0].alpha == 0.5
+
+
 def test_mtl_nvdiffrec_pbr(tmp_path: Path) -> None:
     """``bsdf pbr``: Ks is (occlusion, roughness, metallic), map_Ks its texture."""
     png(tmp_path / "c.png", (200, 100, 50))

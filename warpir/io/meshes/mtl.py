@@ -279,7 +279,7 @@ class MaterialLibrary:
         sheen = self._share(name, "Ps", entry.number("ps", 0.0))
         if sheen > 0.0:
             self.notices.append(f"material {name!r}: sheen of roughness {ROUGHNESS} assumed")
-        alpha = self._share(name, "opacity", entry.number("d", 1.0 - entry.number("tr", 0.0)))
+        alpha = self._share(name, "opacity", self._opacity(name, entry))
         return Material(
             name=name,
             base_color=(red, green, blue),
@@ -320,6 +320,14 @@ class MaterialLibrary:
         if not 0.0 <= value <= 1.0:
             self.notices.append(f"material {name!r}: {what} {value:g} clamped to 0 ... 1")
         return min(max(value, 0.0), 1.0)
+
+    def _opacity(self, name: str, entry: MtlEntry) -> float:
+        """Return d, or else 1 - Tr; a Tr of 1 alone is how MeshLab and scanners write opaque."""
+        transparency = entry.number("tr", 0.0)
+        if transparency == 1.0 and "d" not in entry.numbers:
+            self.notices.append(f"material {name!r}: Tr 1 without d read as opaque")
+            return 1.0
+        return entry.number("d", 1.0 - transparency)
 
     def _ior(self, name: str, entry: MtlEntry) -> float:
         """Return the index of refraction; exporters write 1 (and 0) for materials without one."""
