@@ -912,6 +912,14 @@ def test_gain_map_is_not_applied(tmp_path: Path) -> None:
     assert any("gain map" in notice for notice in photo.notices)
 
 
+def test_what_is_appended_to_a_jpeg_is_not_looked_at(tmp_path: Path) -> None:
+    """A motion photo's film follows the end of the picture; some of its bytes look like scans."""
+    path, codes = tmp_path / "p.jpg", np.full((24, 36, 3), 90, np.uint8)
+    Image.fromarray(codes).save(path, progressive=True)
+    path.write_bytes(path.read_bytes() + 200 * b"film\xff\xda")
+    np.testing.assert_allclose(read_photo(path).codes, codes, atol=2)
+
+
 def gain_map_xmp(attributes: str, content: str = "") -> bytes:
     """Return XMP in the namespaces of Ultra HDR."""
     google = "http://ns.google.com/photos/1.0/container/"

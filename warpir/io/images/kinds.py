@@ -1,5 +1,6 @@
 """What kind of image a file is, by its content, before any library opens it."""
 
+import re
 import stat
 import struct
 from pathlib import Path
@@ -16,6 +17,10 @@ _MAGIC = {
 }
 KINDS = tuple(_MAGIC)
 """Kinds that are read."""
+_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
+"""Start of a segment of a JPEG, which its length follows (ITU-T T.81, B.1.1); between a scan's
+header and the next one stands its data, in which a byte of 255 is followed by none of these."""
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _MOST_SCANS = 100
 """Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 
@@ -75,17 +80,16 @@ def sniff(path: Path) -> tuple[str, bytes]:
 def check_scans(path: Path) -> None:
     """Refuse a JPEG of so many scans that it takes minutes to decode.
 
-    Within a scan's data a byte of 255 is followed by a zero (ITU-T T.81, B.1.1.5), so what is
-    counted are markers, those of an embedded thumbnail too.
+    What a phone appends to its picture, such as a motion photo's film, is not counted.
 
     Raises:
         InputError: More than `_MOST_SCANS`.
     """
-    scans, last = 0, b""
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            scans += (last + block).count(b"\xff\xda")
-            last = block[-1:]
+    content = path.read_bytes()
+    scans, at = 0, 2
+    while (found := _MARKER.search(content, at)) and (marker := found[0][1]) != _END_OF_IMAGE:
+        scans += marker == _START_OF_SCAN
+        at = found.end() + max(int.from_bytes(content[found.end() : found.end() + 2]), 2)
     if scans > _MOST_SCANS:
         what = f"a JPEG of too many scans (found {scans}; limit {_MOST_SCANS})"
         raise InputError(path, what, "save it anew", reason="image.scans", found=scans)
