@@ -224,6 +224,19 @@ def test_M20_vertex_colors_are_decoded_and_noted(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M20")
+def test_M20_polypaint_of_zbrush(tmp_path: Path) -> None:
+    """``#MRGB`` holds mask and colour of each vertex, up to 64 a line; too few are not read."""
+    corner, lines = "ff3366ff", "#MRGB {0}{0}\n#MRGB {0}{0}\n"
+    asset = load_asset(write(tmp_path, SQUARE + lines.format(corner) + FACES))
+    assert asset.primitives[0].colors is not None
+    linear = [[0.0331048, 0.1328683, 1, 1]] * 4
+    np.testing.assert_allclose(asset.primitives[0].colors, linear, rtol=2e-6)
+    asset = load_asset(write(tmp_path, SQUARE + f"#MRGB {corner}\n" + FACES))  # not of all
+    assert asset.primitives[0].colors is None
+    assert any("polypaint" in notice for notice in asset.notices)
+
+
+@pytest.mark.case("M20")
 def test_M20_vertex_colors_of_8_bits(tmp_path: Path) -> None:
     """Whole numbers up to 255 are divided by 255; what is cut is noted."""
     text = SQUARE.replace("v 1 1 0", "v 1 1 0 255 102 0") + FACES

@@ -172,7 +172,20 @@ def _read_statements(path: Path, content: bytes, notices: list[str]) -> Statemen
     if not (text.tables["v"] or text.faces):
         raise OBJ.error(path, "kind", found="no v and no f statements")
     notices += [f"{count} {word[:20]!r} statements ignored" for word, count in left_out.items()]
+    painted = _polypaint(whole)
+    if len(painted) == len(text.tables["v"]) and not text.libraries:
+        text.colors = dict(enumerate(painted)) | text.colors
+    elif painted:
+        notices.append("polypaint (#MRGB) not read: beside materials, or not of every vertex")
     return text
+
+
+def _polypaint(text: str) -> list[list[float]]:
+    """Return ZBrush's colours of the vertices, which stand in comments: mask, red, green, blue."""
+    digits = "".join(re.findall(r"^#MRGB ((?:[0-9A-Fa-f]{8})+)\s*$", text, re.MULTILINE))
+    codes = np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 4)[:, 1:]
+    colors: list[list[float]] = (codes / 255.0).tolist()
+    return colors
 
 
 def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
