@@ -331,6 +331,7 @@ def test_i6_other_content_is_refused(tmp_path: Path, name: str, content: bytes) 
         ("I6-HEIC-mif1", b"\0\0\0\x18ftypmif1"),
         ("I6-AVIF", b"\0\0\0\x1cftypavif"),
         ("I6-camera raw-cr3", b"\0\0\0\x18ftypcrx "),
+        ("I6-a film", b"\0\0\0\x14ftypqt  "),
         ("I6-camera raw-raf", b"FUJIFILMCCD-RAW 0201"),
         ("I6-camera raw-rw2", b"IIU\0\x18\0\0\0"),
         ("I6-camera raw-cr2", b"II*\0\x10\0\0\0CR\x02\0"),

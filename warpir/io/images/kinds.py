@@ -105,7 +105,12 @@ _FOREIGN_KINDS = {
     "PDF": (b"%PDF",),
     "PostScript": (b"%!PS",),
 }
-_BRANDS = {b"avif": "AVIF", b"avis": "AVIF", b"crx ": "camera raw"}
+_BRANDS = {
+    **dict.fromkeys((b"avif", b"avis"), "AVIF"),
+    b"crx ": "camera raw",
+    **dict.fromkeys((b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"), "HEIC"),
+}
+"""Brands of the ISO base media format; the others are films (MP4, MOV)."""
 _NEW_SUBFILE_TYPE, _DNG_VERSION = 254, 50706
 """TIFF tags; bit 0 of the first says that a picture is a reduced version of another."""
 
@@ -113,7 +118,7 @@ _NEW_SUBFILE_TYPE, _DNG_VERSION = 254, 50706
 def _foreign_kind(head: bytes) -> str:
     """Return the name of a kind of image that people have but that is not read, or nothing."""
     if head[4:8] == b"ftyp":
-        return _BRANDS.get(head[8:12], "HEIC")
+        return _BRANDS.get(head[8:12], "a film")
     return next((name for name, starts in _FOREIGN_KINDS.items() if head.startswith(starts)), "")
 
 
