@@ -1103,6 +1103,16 @@ def test_G11_glass_bodies_are_looked_at() -> None:
     assert glass_notices([inward], [replace(solid, thickness=0.0)]) == []
 
 
+def test_G25_scale_of_zero_on_all_axes_hides(tmp_path: Path) -> None:
+    """So animations hide a part and its children, by the specification; the rest is drawn."""
+    builder = Builder()
+    nodes = [{"mesh": 0}, {"mesh": 0, "scale": [0, 0, 0], "children": [2]}, {"mesh": 0}]
+    builder.json.update(nodes=nodes, scenes=[{"nodes": [0, 1]}])
+    asset = load(tmp_path, builder)
+    assert len(asset.primitives) == 1
+    assert sum("hides it" in notice for notice in asset.notices) == 2
+
+
 @pytest.mark.parametrize("fallback", [None, {}, {"baseColorFactor": [1, 0, 0, 1]}])
 def test_G11_specular_glossiness_is_converted(
     tmp_path: Path, fallback: dict[str, Any] | None

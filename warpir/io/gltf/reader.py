@@ -157,6 +157,9 @@ def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[Placed]:
             continue
         # The joints alone place a skinned mesh; its own node does not count.
         joints = skins.read(node) if "skin" in node else None
+        if joints is None and not world[:3, :3].any():
+            notices.append(f"{node.pointer}: scaled to nothing, which hides it")
+            continue
         instances = [np.eye(4)] if joints is not None else read_instances(file, node, world)
         for number, matrix in enumerate(instances):
             check_invertible(node, matrix, f" of instance {number}" if len(instances) > 1 else "")
