@@ -884,6 +884,25 @@ def test_what_a_jpeg_says_is_noted(
     assert any(words in notice for notice in photo.notices)
 
 
+@pytest.mark.parametrize(("index", "space"), [("R03", 65535), ("R98", 65535), ("R03", 1)])
+def test_adobe_rgb_that_exif_alone_states(
+    tmp_path: Path, rng: np.random.Generator, index: str, space: int
+) -> None:
+    """A camera set to Adobe RGB may embed no profile: as if it had, against the same with one."""
+    codes, exif = codes8(rng), Image.Exif()
+    exif.get_ifd(0x8769).update({0xA001: space, 0xA005: {1: index, 2: b"0100"}})
+    Image.fromarray(codes).save(tmp_path / "p.jpg", exif=exif, quality=100, subsampling=0)
+    plain = np.asarray(Image.open(tmp_path / "p.jpg")) / 255.0
+    is_adobe = (index, space) == ("R03", 65535)
+    if is_adobe:
+        xy = color.chromaticities_of("Adobe RGB (1998)")
+        linear = plain ** (563 / 256) @ color.primaries_to_rec709(xy).T
+        plain = np.clip(color.linear_to_srgb(linear), 0.0, 1.0)
+    photo = read_photo(tmp_path / "p.jpg")
+    assert (photo.icc is not None) == is_adobe
+    np.testing.assert_allclose(photo.srgb, plain, atol=0.01)
+
+
 def test_gain_map_is_not_applied(tmp_path: Path) -> None:
     """An Ultra HDR picture, as Android writes it, is its base image, with its EXIF and orientation.
 

@@ -34,6 +34,13 @@ _CICP_CURVES = {
     **dict.fromkeys((1, 6, 14, 15), (1.0 / 0.45, 1.0 / 1.099, 0.099 / 1.099, 1.0 / 4.5, 0.081)),
 }
 """Code points of ITU-T H.273; curves as an ICC parametric curve of type 0 or 3 has them."""
+_EXIF_BYTES = 1 << 17
+"""EXIF is the first or the second segment of a JPEG, each of 64 KiB at most [byte]."""
+_ADOBE_RGB = [
+    (struct.pack(f"{k}HHIH", 0xA001, 3, 1, 65535), struct.pack(f"{k}HHI4s", 1, 2, 4, b"R03"))
+    for k in "<>"
+]
+"""Entries of EXIF in either byte order: ColorSpace uncalibrated, InteroperabilityIndex R03."""
 
 
 def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]:
@@ -79,6 +86,18 @@ def png_profile(path: Path, icc: bytes | None) -> tuple[bytes | None, list[str]]
     if np.allclose(xy, color.REC709_CHROMATICITIES, atol=2e-3) and abs(gamma * 2.2 - 1.0) < 0.01:
         return None, []
     return matrix_profile(xy, _parametric((1.0 / gamma,))), []
+
+
+def camera_profile(path: Path) -> bytes | None:
+    """Return the profile of a JPEG that carries none and is Adobe RGB by its EXIF; None for sRGB.
+
+    Cameras that are set to it state it so (DCF 2.0), and often write no profile.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(_EXIF_BYTES)
+    if not any(all(entry in head for entry in entries) for entries in _ADOBE_RGB):
+        return None
+    return matrix_profile(color.chromaticities_of("Adobe RGB (1998)"), _parametric((563 / 256,)))
 
 
 def grey_profile(icc: bytes) -> bytes:

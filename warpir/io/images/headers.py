@@ -97,7 +97,10 @@ def header_notices(spec: Any, kind: str, head: bytes) -> list[str]:
     ):
         notices.append("CMYK converted without its profile; export as RGB for exact colours")
     if spec.getattribute("Exif:ColorSpace") == 65535:
-        notices.append("EXIF says uncalibrated colour; its profile, or else sRGB, is used")
+        notices.append(
+            "EXIF says uncalibrated colour; its profile, Adobe RGB where EXIF names it, or else "
+            "sRGB, is used"
+        )
     aspect = spec.get_float_attribute("PixelAspectRatio", 1.0)
     if kind == "exr" and abs(aspect - 1.0) > 1e-3:
         notices.append(f"pixel aspect ratio {aspect:g} is not followed: pixels are taken as square")

@@ -18,6 +18,7 @@ from warpir.core.arrays import Float64Array, FloatArray, PixelArray, by_pixel
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.color_profile import (
+    camera_profile,
     convert_profile,
     grey_profile,
     png_profile,
@@ -435,6 +436,8 @@ def _to_srgb(
     if image.kind == "png":
         icc, ignored = png_profile(path, icc)
         notices += ignored
+    elif image.kind == "jpeg" and icc is None and not image.is_grey:
+        icc = camera_profile(path)
     if icc is None:
         return codes, srgb, None
     codes, srgb, icc, notice = convert_profile(
