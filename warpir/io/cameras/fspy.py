@@ -23,6 +23,12 @@ from warpir.io.cameras.source import (
 )
 from warpir.scene.camera import Camera
 
+METRES = {
+    "Millimeters": 0.001, "Centimeters": 0.01, "Meters": 1.0, "Kilometers": 1000.0,
+    "Inches": 0.0254, "Feet": 0.3048, "Yards": 0.9144, "Miles": 1609.344,
+}  # fmt: skip
+"""What the units of a reference distance are [m]."""
+
 
 def read_fspy_project(path: Path, limits: Limits) -> PhotoCamera:
     """Read a binary fSpy project: magic, three u32, JSON, image."""
@@ -65,5 +71,25 @@ def read_fspy(path: Path, content: dict[str, Any]) -> PhotoCamera:
     k = int(np.argmax(np.abs(camera_up)))
     axis = f"{'+' if camera_up[k] > 0.0 else '-'}{'xyz'[k]}"
     assumed = (f"{axis} of the fSpy world points up; --up overrides",)
-    camera = Camera(width, height, focal, focal, cx, cy, c2w, assumed=assumed)
+    metres, notices = _unit(content)
+    c2w[:3, 3] *= metres
+    camera = Camera(width, height, focal, focal, cx, cy, c2w, notices, assumed)
     return PhotoCamera(camera, world=UP_TO_Y[axis])
+
+
+def _unit(content: dict[str, Any]) -> tuple[float, tuple[str, ...]]:
+    """Return metres per unit of the fSpy world, and what is done about it.
+
+    A reference distance tells it, which projects have where one was set, and exports never. Without
+    one fSpy puts the camera at an arbitrary distance from the origin.
+    """
+    settings = content.get("calibrationSettingsBase")
+    settings = settings if isinstance(settings, dict) else {}
+    unit = settings.get("referenceDistanceUnit")
+    if settings.get("referenceDistanceAxis") is None or str(unit) not in METRES:
+        return 1.0, (
+            "no reference distance with a unit in the fSpy file: lengths are in its units, not in "
+            "metres (--size, or set one in fSpy and give its .fspy project)",
+        )
+    converted = f"lengths converted from fSpy's {str(unit).lower()} to metres"
+    return METRES[str(unit)], () if unit == "Meters" else (converted,)
