@@ -71,6 +71,10 @@ def read_nerfstudio(
         number(path, said, "cx") if "cx" in said else width / 2.0,
         number(path, said, "cy") if "cy" in said else height / 2.0,
         rigid(path, matrix, frames[k].get("transform_matrix")),
+        (
+            "only the exporter of the transforms.json knows whether its lengths are metres; those "
+            "found by COLMAP are not (--size)",
+        ),
         assumed=(
             "+z of the transforms.json points up, as nerfstudio has it; only its exporter "
             "knows whether gravity agrees (--up, --ground)",
