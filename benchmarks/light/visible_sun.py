@@ -7,10 +7,9 @@ place) and outside (seven): pitch -15 to 35 degrees, vertical field of view 35 t
 by half a stop, the camera's glare in half of them, one of two responses, 8 bits. A panorama is
 judged by the networks that have not learned from it. Places are halved by the checksum of their
 names; ``--fit`` fits the rule's weights to one half. The errors of the light are those of crops
-with an unclouded sun in them, before and after; ``--asset`` renders composites of some of them.
+with an unclouded sun in them, before and after.
 """
 
-import argparse
 import json
 import zlib
 from collections.abc import Iterator
@@ -26,27 +25,18 @@ from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import expose, linear_to_gamma, luminance
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
-from warpir.evaluate.image_errors import image_errors, make_regions
-from warpir.evaluate.light_errors import light_errors
 from warpir.evaluate.scenes import (
     CAMERA_HEIGHT,
     RESPONSES,
     Place,
-    Subject,
     crop_camera,
     crop_radiance,
-    with_surface,
 )
-from warpir.evaluate.stage import Prediction, Quality, Stage, unseen_by
-from warpir.io.assets import load_asset
+from warpir.evaluate.stage import unseen_by
 from warpir.io.images.photos import read_envmap
 from warpir.lighting import visible_sun
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import Regressor, load_regressor
-from warpir.render.device import choose_device
-from warpir.scene.asset import Asset
-from warpir.scene.light import Light, as_map
-from warpir.scene.placement import place_asset
 from warpir.train.lights import SPLIT_HEIGHT, split_sun
 
 WIDTH, HEIGHT = 288, 192
@@ -58,12 +48,6 @@ SUN_SHARE, SUN_PEAK = 0.2, 3000.0
 """An unclouded sun: least share of the flux from its cap, and least peak over the mean [1]."""
 FOUND_DEG, WRONG_DEG = 2.0, 4.0
 """A sun is found within the first; what is found beyond the second is a false alarm [deg]."""
-STAND = (0.5 * WIDTH, 0.85 * HEIGHT)
-"""Where the object of the composites stands [px]."""
-STEEP = 0.07
-"""Least sine of the angle at which the camera looks down on it [1]."""
-OBJECT_SIZE = 0.25
-"""Longest side of the object over its distance from the camera [1]."""
 RIDGE = 0.15
 """Weight of the squared weights in the fit."""
 LIKELY, OPINION_MAX = -1.5, 1.5
@@ -246,11 +230,6 @@ def detection(judged: list[Judged], weights: Float64Array, bias: float) -> dict[
     }
 
 
-def steepness(crop: Crop) -> float:
-    """Return the sine of the angle at which the camera looks down on the object's foot [1]."""
-    return -float(crop.place.camera.ray(*STAND)[1][1])
-
-
 def sun_and_rest(truth: Truth) -> tuple[float, float]:
     """Return what the sun gives a surface that faces it, and the flux of all else; luminances."""
     split = split_sun(resize_map(truth.texels, SPLIT_HEIGHT))
@@ -299,58 +278,10 @@ def light_before_and_after(judged: list[Judged]) -> dict[str, dict[str, float]]:
     }
 
 
-def subject_of(crop: Crop, asset: Asset, path: Path) -> Subject:
-    """Return an object on the ground of a crop, matt."""
-    size = OBJECT_SIZE * CAMERA_HEIGHT / steepness(crop)
-    camera = crop.place.camera
-    placement = place_asset(*asset.bounds(), camera, at=STAND, rotate_y=30.0, size=size)
-    return Subject(crop.place, with_surface(asset, 0.0, 1.0), path, "diffuse", placement)
-
-
-def composite_errors(stage: Stage, light: Light) -> dict[str, float]:
-    """Return the errors of a light and of the composite under it."""
-    errors = light_errors(as_map(light, 128), stage.place.texels)
-    figures = {
-        "peak_angle_deg": errors["peak_angle_deg"],
-        "log_sun_sky": abs(errors["log_own_sun_sky_ratio_error"]),
-        "log_flux": abs(errors["log_flux_error"]),
-    }
-    prediction = Prediction.of(light)
-    image = stage.compose(stage.render(prediction), prediction.curves)
-    regions = image_errors(image, stage.truth, make_regions(stage.mask, stage.ratio))
-    return figures | {f"rmse_{k}": v["rmse"] for k, v in regions.items() if v}
-
-
-def before_and_after(judged: list[Judged], options: argparse.Namespace) -> dict[str, Any]:
-    """Compare both lights where a sun is in view: one crop of each place that shows the ground."""
-    device, asset = choose_device(options.device), load_asset(options.asset, "grey")
-    rows: dict[str, list[dict[str, float]]] = {"before": [], "after": []}
-    seen = set[str]()
-    for j in judged:
-        if not is_sun_crop(j) or j.crop.truth.name in seen or steepness(j.crop) < STEEP:
-            continue
-        assert j.regression is not None
-        seen.add(j.crop.truth.name)
-        place = j.crop.place
-        after = visible_sun.with_visible_sun(j.regression, place.photo, place.camera)
-        subject = subject_of(j.crop, asset, options.asset)
-        stage = Stage(subject, device, Quality(samples=options.samples), 0)
-        for name, regression in (("before", j.regression), ("after", after)):
-            rows[name].append(composite_errors(stage, Light(lobes=regression.lobes())))
-    return {
-        name: {k: float(np.mean([r[k] for r in found if k in r])) for k in found[0]}
-        | {"places": len(found)}
-        for name, found in rows.items()
-        if found
-    }
-
-
 def main() -> None:
-    """Print and write what is found, and what it does to light and composites."""
-    parser = flags(__doc__, "panoramas", "device", "json")
-    parser.add_argument("--asset", type=Path, help="object of the composites; none without it")
+    """Print and write what is found, and what it does to the light."""
+    parser = flags(__doc__, "panoramas", "json")
     parser.add_argument("--fit", action="store_true", help="fit the rule to one half of the places")
-    parser.add_argument("--samples", type=int, default=32)
     options = parser.parse_args()
     network = load_regressor(None)
     judged = []
@@ -370,8 +301,6 @@ def main() -> None:
     record |= {name: detection(half, weights, bias) for name, half in halves.items()}
     record["suns in view"] = suns_in_view(halves["tuned on"])
     record["light"] = light_before_and_after(halves["held out"])
-    if options.asset is not None:
-        record["composites"] = before_and_after(halves["held out"], options)
     print(json.dumps(record, indent=2))
     write_json(options.json, record, indent=2)
 
