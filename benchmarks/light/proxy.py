@@ -29,6 +29,7 @@ from warpir.core.latlong import look_up, resize_map, rotate_map
 from warpir.demo import ASSET, LIGHT
 from warpir.evaluate.image_errors import rmse
 from warpir.io.assets import load_asset
+from warpir.io.gltf.reader import place
 from warpir.io.images.photos import Photo, read_envmap
 from warpir.mitsuba.render import Setting, foreground
 from warpir.render.composite import make_picture
@@ -100,16 +101,8 @@ def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
     materials: list[Material] = []
     textures: list[Texture] = []
     for asset, matrix in parts:
-        linear, offset = matrix[:3, :3], matrix[:3, 3]
         for p in asset.primitives:
-            normals = p.normals
-            if normals is not None:
-                turned = normals @ np.linalg.inv(linear)
-                length = np.linalg.norm(turned, axis=1, keepdims=True)
-                normals = (turned / length).astype(np.float32)
-            positions, material = p.positions @ linear.T + offset, p.material + len(materials)
-            moved = {"positions": positions, "normals": normals, "material": material}
-            primitives.append(replace(p, **moved, tangents=None))
+            primitives.append(replace(place(p, matrix), material=p.material + len(materials)))
         for m in asset.materials:
             slots = {
                 name: replace(slot, texture=slot.texture + len(textures))

@@ -21,7 +21,7 @@ import warp as wp
 
 from benchmarks.measure import context, flags, peak_mib, table, write_json
 from benchmarks.scenes import on_the_ground
-from benchmarks.speed.scenes import sun_and_sky, uv_ball
+from benchmarks.speed.scenes import standing_ball, sun_and_sky
 from warpir.core.memory import core_count
 from warpir.render.device import choose_device
 from warpir.render.picture.planes import render
@@ -60,7 +60,7 @@ def render_one(width: int, triangles: int, samples: int, device: str) -> dict[st
     """
     camera = camera_from_fov(width, width * 2 // 3, 40.0, -12.0, 1.4)
     rows = max(8, round(np.sqrt(triangles / 4.0)))
-    asset = Asset("ball", (uv_ball(rows, 2 * rows),), (Material(roughness=0.4),))
+    asset = Asset("ball", (standing_ball(rows),), (Material(roughness=0.4),))
     pose = place_asset(*asset.bounds(), camera, place=(-0.3, 0.0, -5.5), size=1.5).asset_to_world
     curves = Curves.identity("reinhard")
     light = Light(None, rasterize_lobes(sun_and_sky(), 256, 512))

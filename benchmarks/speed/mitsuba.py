@@ -6,7 +6,7 @@ is blocked. Set the variant before importing this module.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,9 +17,7 @@ from mitsuba.python.ad.integrators.common import mis_weight
 from benchmarks.speed.scenes import SpeedScene
 from warpir.core.arrays import Float64Array, FloatArray, PixelArray
 from warpir.mitsuba.light import LatlongEmitter
-from warpir.mitsuba.plane import ObjectScene
-from warpir.mitsuba.render import build
-from warpir.scene.camera import Camera, mitsuba_sensor
+from warpir.mitsuba.render import build, sensor_of
 
 PASS_SAMPLES = {"llvm_ad_rgb": 1 << 25, "cuda_ad_rgb": 1 << 28}
 """Camera samples traced at once; bounds memory. Passes are long, as only samples of one pass are
@@ -90,7 +88,16 @@ class MitsubaScene:
         self.weight_ratio = color(scene.weight_ratio)
         self.given: dict[str, Any] = {
             "scene": self.setup.scene,
-            "sensor": _sensor(scene.camera, self.setup, (left, top, self.crop[1], height), sampler),
+            "sensor": sensor_of(
+                scene.camera,
+                self.setup.center,
+                self.setup.radius,
+                sampler,
+                crop_offset_x=left,
+                crop_offset_y=top,
+                crop_width=self.crop[1],
+                crop_height=height,
+            ),
             "texels": self.parameters["light.texels"],
             "d_image": mi.TensorXf(d_image.reshape(*self.crop, 3)),
             "pixels": mi.UInt32(scene.receiver_pixels.astype(np.uint32)),
@@ -291,30 +298,6 @@ def _passes(pixels: int, spp: int, seed: int) -> Iterator[tuple[mi.UInt32, int]]
     for k, start in enumerate(range(0, spp, largest)):
         pass_seed = dr.opaque(mi.UInt32, (seed * 65537 + k) % (1 << 32))
         yield pass_seed, min(largest, spp - start)
-
-
-def _sensor(
-    camera: Camera, setup: ObjectScene, crop: tuple[int, int, int, int], sampler: str
-) -> mi.Sensor:
-    """Mitsuba camera in the unit frame, see `warpir.mitsuba.render`; crop is left, top, size."""
-    c2w = camera.c2w.copy()
-    c2w[:3, 3] = (c2w[:3, 3] - setup.center) / setup.radius
-    view = mitsuba_sensor(replace(camera, c2w=c2w))
-    names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
-    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height}
-    film |= {"pixel_format": "rgb", "component_format": "float32", "rfilter": {"type": "box"}}
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "to_world": mi.ScalarTransform4f(view["to_world"]),
-            "fov_axis": "x",
-            "fov": view["fov_deg"],
-            "principal_point_offset_x": view["principal_point_offset_x"],
-            "principal_point_offset_y": view["principal_point_offset_y"],
-            "film": {**film, **dict(zip(names, crop, strict=True))},
-            "sampler": {"type": sampler},
-        }
-    )
 
 
 def ratio_adjoint(

@@ -5,12 +5,13 @@ lat-long map, so that all estimate the same integrals; the loss is linear in the
 the shadow ratio, with weights that are part smooth and part noise, as a guidance gradient is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.referee.subjects import ball
 from benchmarks.scenes import on_the_ground
 from benchmarks.speed.textured import textured_heap
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
@@ -84,33 +85,10 @@ class SpeedScene:
         return rasterize_lobes(self.lobes, height, 2 * height)
 
 
-def uv_ball(rows: int = 128, columns: int = 256) -> Primitive:
-    """Return a unit ball of ``2 columns (rows - 1)`` triangles standing on y = 0."""
-    polar = np.pi * np.arange(1, rows) / rows
-    around = 2.0 * np.pi * np.arange(columns) / columns
-    ring = np.stack(
-        [
-            np.sin(polar)[:, None] * np.sin(around),
-            np.broadcast_to(np.cos(polar)[:, None], (rows - 1, columns)),
-            np.sin(polar)[:, None] * np.cos(around),
-        ],
-        axis=-1,
-    )
-    unit = np.concatenate([[[0.0, 1.0, 0.0]], ring.reshape(-1, 3), [[0.0, -1.0, 0.0]]])
-    here = np.arange(columns)
-    right = (here + 1) % columns
-    first, last = 1, 1 + (rows - 2) * columns
-    faces = [np.stack([np.zeros_like(here), first + here, first + right], axis=-1)]
-    for start in range(first, last, columns):
-        a, b, c, d = start + here, start + right, start + columns + here, start + columns + right
-        faces += [np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]
-    faces.append(np.stack([last + right, last + here, np.full_like(here, len(unit) - 1)], axis=-1))
-    return Primitive(
-        unit + np.array([0.0, 1.0, 0.0]),
-        np.concatenate(faces).astype(np.int32),
-        0,
-        normals=unit.astype(np.float32),
-    )
+def standing_ball(rings: int = 128) -> Primitive:
+    """Return a unit ball of ``4 rings (rings - 1)`` triangles standing on y = 0."""
+    unit = ball(rings)
+    return replace(unit, positions=unit.positions + np.array([0.0, 1.0, 0.0]))
 
 
 def sun_and_sky(seed: int = 7) -> Lobes:
@@ -190,7 +168,7 @@ def _contents(name: str, assets: Path) -> tuple[Asset, Lobes, int]:
         metallic=1.0 if metal else 0.0,
         roughness=0.3 if metal else 0.6,
     )
-    return Asset(name, (uv_ball(),), (material,)), sun_and_sky(), 3
+    return Asset(name, (standing_ball(),), (material,)), sun_and_sky(), 3
 
 
 def loss_weights(width: int, height: int) -> FloatArray:

@@ -26,7 +26,7 @@ from benchmarks.light.recovery import (
     sun_sky_ratio,
     true_curves,
 )
-from benchmarks.speed.scenes import uv_ball
+from benchmarks.speed.scenes import standing_ball
 from tests import oracles as o
 from tests.builders.shapes import box
 from warpir.app.settings import OptimizeSettings
@@ -80,7 +80,7 @@ def real_sky() -> FloatArray:
 
 def ball_and_box() -> Asset:
     """A ball of 2 m and a taller box beside it: smooth shading, and a shadow with an edge."""
-    parts = uv_ball(24, 48), box((1.6, 0.9, 0.3), (0.5, 1.8, 0.5))
+    parts = standing_ball(24), box((1.6, 0.9, 0.3), (0.5, 1.8, 0.5))
     return Asset("ball and box", parts, (Material(base_color=(0.8, 0.5, 0.4), roughness=0.5),))
 
 

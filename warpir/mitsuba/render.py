@@ -306,8 +306,10 @@ def _mesh(asset: Asset, index: int, positions: Float64Array, linear: Float64Arra
     return mesh
 
 
-def sensor_of(camera: Camera, center: Float64Array, radius: float) -> mi.Sensor:
-    """Mitsuba camera in the unit frame, box filter."""
+def sensor_of(
+    camera: Camera, center: Float64Array, radius: float, sampler: str = "independent", **crop: int
+) -> mi.Sensor:
+    """Mitsuba camera in the unit frame, box filter; ``crop`` is the film's, as ``crop_width``."""
     c2w = camera.c2w.copy()
     c2w[:3, 3] = (c2w[:3, 3] - center) / radius
     view = mitsuba_sensor(replace(camera, c2w=c2w))
@@ -326,8 +328,9 @@ def sensor_of(camera: Camera, center: Float64Array, radius: float) -> mi.Sensor:
                 "pixel_format": "rgb",
                 "component_format": "float32",
                 "rfilter": {"type": "box"},
+                **crop,
             },
-            "sampler": {"type": "independent"},
+            "sampler": {"type": sampler},
         }
     )
 
