@@ -3,9 +3,10 @@
 import re
 from pathlib import Path
 
-from benchmarks.assets import CASES, TESTS
-
 ROOT = Path(__file__).resolve().parents[2]
+CASES = (*(f"G{k}" for k in range(1, 30)), *(f"M{k}" for k in range(1, 23)))
+TESTS = ("gltf", "obj", "placement", "render", "command", "faults")
+"""Where the tests of the cases are."""
 
 
 def test_every_case_has_its_row_and_its_tests() -> None:
