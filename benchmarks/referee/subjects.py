@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tests.builders.poses import rotation
 from tests.builders.shapes import camera, quad
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.asset import Asset, Material, Primitive, Texture
@@ -54,13 +55,8 @@ def view(
 ) -> Camera:
     """Camera at ``(0, 0, distance)`` turned about +Y to look from another side, along -Z."""
     focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
-    angle = np.radians(turn)
     c2w = np.eye(4)
-    c2w[:3, :3] = [
-        [np.cos(angle), 0.0, np.sin(angle)],
-        [0.0, 1.0, 0.0],
-        [-np.sin(angle), 0.0, np.cos(angle)],
-    ]
+    c2w[:3, :3] = rotation(np.radians(turn))
     c2w[:3, 3] = c2w[:3, :3] @ [0.0, 0.0, distance]
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, c2w)
 

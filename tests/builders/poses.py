@@ -1,24 +1,22 @@
-"""Cameras at random, and points that they see."""
+"""Rotations, cameras at random, and points that they see."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+    """Turn about +Z by the roll, then about +X by the pitch, then about +Y by the yaw [rad]."""
+    return Rotation.from_euler("YXZ", [yaw, pitch, roll]).as_matrix()
 
 
 def pose(rng: np.random.Generator, tilt: float = 0.3) -> np.ndarray:
     """A random camera whose up axis stays close to +Y."""
-    yaw, pitch, roll = rng.uniform(-3, 3), rng.uniform(-tilt, tilt), rng.uniform(-0.1, 0.1)
-    about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-    about_x = np.array(
-        [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
-    )
-    about_z = np.array(
-        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
-    )
     c2w = np.eye(4)
-    c2w[:3, :3] = about_y @ about_x @ about_z
+    c2w[:3, :3] = rotation(rng.uniform(-3, 3), rng.uniform(-tilt, tilt), rng.uniform(-0.1, 0.1))
     c2w[:3, 3] = rng.normal(size=3)
     return c2w
 

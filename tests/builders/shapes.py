@@ -174,8 +174,10 @@ def a_camera(**changes: Any) -> CameraEstimate:
     return CameraEstimate(**plain | changes)
 
 
-def box_before(view: Camera, srgb: FloatArray, codes: np.ndarray) -> Inputs:
+def box_before(
+    view: Camera, srgb: FloatArray, codes: np.ndarray, light: Light | None = None
+) -> Inputs:
     """A photo of level ground, and a box of a metre that stands on it, five metres ahead."""
     asset = Asset("box", (box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0)),), (Material(),))
     placement = place_asset(*asset.bounds(), view, place=(0.0, 0.0, -5.0))
-    return Inputs(Photo(codes, srgb, "png"), asset, view, placement)
+    return Inputs(Photo(codes, srgb, "png"), asset, view, placement, light)

@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from tests.builders.poses import rotation
 from warpir.calibration.network import HEIGHT, NUMBERS, WIDTH, load_calibrator
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.train.camera.crops import (
@@ -86,15 +87,9 @@ def test_field_points_up_in_the_picture() -> None:
     field = drawn.field().unflatten(1, (HEIGHT // SHAPE[0], WIDTH // SHAPE[1]))
     plane = drawn.plane(HEIGHT // SHAPE[0], WIDTH // SHAPE[1]).double()
     for k in range(0, 64, 7):
-        pitch, roll = float(drawn.pitch[k]), float(drawn.roll[k])
-        tilt = np.array(
-            [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
-        )
-        turn = np.array(
-            [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
-        )
+        turn = rotation(0.0, float(drawn.pitch[k]), float(drawn.roll[k]))
         x, y = plane[k, 3, 5].tolist()
-        point = np.array([x, y, -1.0]) + 1e-6 * (tilt @ turn).T @ np.array([0.0, 1.0, 0.0])
+        point = np.array([x, y, -1.0]) + 1e-6 * turn.T @ np.array([0.0, 1.0, 0.0])
         moved = shown(point[:2] / -point[2]) - shown(np.array([x, y]))
         np.testing.assert_allclose(
             field[k, 3, 5, :2].numpy(), moved / np.linalg.norm(moved), atol=1e-3

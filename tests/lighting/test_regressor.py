@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
+from tests.builders.poses import rotation
 from tests.builders.shapes import a_regression
 from warpir.calibration.forward import softmax
 from warpir.core.errors import ExitCode, InputError
@@ -72,11 +73,9 @@ FLOAT32 = 1e-5
 
 def turned(camera: Camera, yaw_deg: float, roll_deg: float = 0.0) -> Camera:
     """Turn a camera about the world's +Y, and before that about its own viewing axis."""
-    a, r = np.radians(yaw_deg), np.radians(roll_deg)
-    about_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    about_z = np.array([[np.cos(r), -np.sin(r), 0], [np.sin(r), np.cos(r), 0], [0, 0, 1]])
     c2w = camera.c2w.copy()
-    c2w[:3, :3] = about_y @ c2w[:3, :3] @ about_z
+    about_z = rotation(roll=np.radians(roll_deg))
+    c2w[:3, :3] = rotation(np.radians(yaw_deg)) @ c2w[:3, :3] @ about_z
     return replace(camera, c2w=c2w)
 
 

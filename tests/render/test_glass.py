@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.builders.poses import rotation
 from tests.builders.shapes import (
     all_pixels,
     box,
@@ -168,7 +169,7 @@ def test_slab_is_the_series_of_its_reflections(tilt: float, device: str) -> None
     """``R = F + F T^2 A^2 / (1 - F^2 A^2)``, ``T = (1 - F)^2 A / (1 - F^2 A^2)``, tint at each."""
     view, ior, thick, tint = camera(8, 8, 4000.0), 1.5, 0.5, np.array([0.9, 0.8, 0.5])
     a = np.radians(tilt)
-    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    turn = rotation(a)
     slab = box((0, 0, 0), (90.0, 90.0, thick))
     slab = replace(slab, positions=slab.positions @ turn.T + [0, 0, -20.0])
     material = replace(GLASS, ior=ior, base_color=tuple(tint), **GREEN)

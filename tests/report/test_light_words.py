@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.builders.poses import rotation
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.latlong import map_directions
 from warpir.report.words import (
@@ -25,11 +26,8 @@ TEXEL = 180.0 / 128
 
 def turned(azimuth_deg: float, pitch_deg: float = 0.0) -> Float64Array:
     """Pose of a camera that looks toward an azimuth, up by the pitch."""
-    a, p = np.radians(-azimuth_deg), np.radians(pitch_deg)
-    yaw = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    tilt = np.array([[1, 0, 0], [0, np.cos(p), -np.sin(p)], [0, np.sin(p), np.cos(p)]])
     pose = np.eye(4)
-    pose[:3, :3] = yaw @ tilt
+    pose[:3, :3] = rotation(*np.radians([-azimuth_deg, pitch_deg]))
     return pose
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.builders.shapes import box, camera, constant, lobe
+from tests.builders.shapes import box_before, camera, constant, lobe
 from tests.oracles import (
     latlong_direction,
     luminance,
@@ -19,11 +19,9 @@ from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import map_directions, resize_map, rotate_map, texel_solid_angles
-from warpir.io.images.photos import Photo
 from warpir.lighting.fit import LAMP_COUNT_MAX, fit_lobes
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY, SceneLight, make_light
 from warpir.render.device_light import light_args
-from warpir.scene.asset import Asset, Material
 from warpir.scene.lamps import LAMP_RADIUS_DEG, suns_of
 from warpir.scene.light import (
     Light,
@@ -38,7 +36,6 @@ from warpir.scene.light import (
     summarize,
     sun_lobe,
 )
-from warpir.scene.placement import place_asset
 
 FLOAT32 = 1e-5
 """Relative; what float32 maps keep of a float64 sum."""
@@ -494,11 +491,7 @@ def inputs_for(level: float | FloatArray, light: Light | None = None) -> Inputs:
     srgb = np.asarray(level, np.float32) ** np.float32(1.0 / 2.2)
     srgb = np.broadcast_to(srgb, (32, 48, 3)).astype(np.float32)
     codes = np.round(srgb * 65535.0).astype(np.uint16)
-    view = camera(48, 32, 48.0, (0.0, 1.5, 0.0), -15.0)
-    part = box((0.0, 0.5, 0.0), (1.0, 1.0, 1.0))
-    asset = Asset("box", (part,), (Material(),))
-    placement = place_asset(*asset.bounds(), view, place=(0.0, 0.0, -5.0))
-    return Inputs(Photo(codes, srgb, "png"), asset, view, placement, light)
+    return box_before(camera(48, 32, 48.0, (0.0, 1.5, 0.0), -15.0), srgb, codes, light)
 
 
 def config_for(tone: str = "reinhard", **values: object) -> InsertConfig:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.builders.poses import rotation
 from warpir.core.latlong import map_directions, rotate_map, texel_solid_angles
 from warpir.io.images.envmap_conventions import (
     IN_CAMERA_AXES,
@@ -81,11 +82,7 @@ TOOLS: dict[str, Uv] = {
 
 def pose(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
     """Camera to world rotation, angles in degrees."""
-    a, b, c = np.radians([yaw, pitch, roll])
-    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    tilt = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
-    lean = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
-    return np.asarray(turn @ tilt @ lean)
+    return rotation(*np.radians([yaw, pitch, roll]))
 
 
 CAMERA = pose(35.0, -12.0, 4.0)
