@@ -20,7 +20,7 @@ from warpir.batch.ray import RayWorkers
 from warpir.batch.scene import LOGS, STATES, Scene
 from warpir.batch.task import CHECK, COMPILE, DONE_BEFORE, INSERT, Answer, Task
 from warpir.core.atomic import write_file
-from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.errors import ExitCode, InputError, disk_errors
 from warpir.core.memory import core_count, free_host
 from warpir.core.progress import duration
 from warpir.core.signals import whole
@@ -178,7 +178,7 @@ class Batch:
             "scenes": [scene.record() for scene in self.scenes],
         }
         lines = "".join(json.dumps(scene.failure()) + "\n" for scene in failed)
-        try:
+        with disk_errors(self.options.out / SUMMARY):
             with whole():
                 # First: a list of failures without a summary is somebody else's.
                 write_file(self.options.out / SUMMARY, json_bytes(summary))
@@ -187,8 +187,6 @@ class Batch:
             page = batch_page(self.options.manifest, self.options.out, self.scenes, seconds)
             with whole():
                 write_file(self.options.out / PAGE, page)
-        except OSError as error:
-            raise disk_error(self.options.out / SUMMARY, error) from error
 
     def raise_failures(self, what: str) -> None:
         """End with the status of the first scene that failed.

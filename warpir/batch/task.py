@@ -22,7 +22,7 @@ from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.program import explain, say, stay_offline
 from warpir.app.run import memory_needs, needed_bytes, require_space
 from warpir.core import signals
-from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.errors import ExitCode, InputError, disk_errors
 from warpir.core.memory import lacked_memory, release
 from warpir.insert import insert
 from warpir.io.results import OutputFolder
@@ -241,12 +241,10 @@ def _printing_to(path: str | None, is_new: bool) -> Iterator[None]:
         InputError: It cannot be written (`ExitCode.RESOURCES`).
     """
     mode = os.O_TRUNC if is_new and path is not None else os.O_APPEND
-    try:
+    with disk_errors(path or os.devnull):
         if path is not None:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
         target = os.open(path or os.devnull, os.O_WRONLY | os.O_CREAT | mode, 0o644)
-    except OSError as error:
-        raise disk_error(path or os.devnull, error) from error
     before = [os.dup(1), os.dup(2)]
     try:
         os.dup2(target, 1)

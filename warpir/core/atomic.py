@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
-from warpir.core.errors import InputError, disk_error
+from warpir.core.errors import InputError, disk_errors
 from warpir.core.signals import whole
 from warpir.core.strict_json import read_json_object
 
@@ -234,17 +234,14 @@ class Checkpoints:
         }
         serial = 1 + max((int(name.split("-")[0]) for name in self._names()), default=0)
         path = self.folder / f"{serial:06d}-{stage}-{step}"
-        try:
-            with whole():
-                self.folder.mkdir(exist_ok=True)
-                for abandoned in self.folder.glob(".partial-*"):  # of killed runs: --out is locked
-                    shutil.rmtree(abandoned)
-                text = json.dumps(manifest | {"manifest_sha256": manifest_digest(manifest)})
-                write_folder(path, [(STATE, content), (MANIFEST, text.encode())])
-                for old in list(self._names())[KEPT:]:
-                    remove_folder(self.folder / old)
-        except OSError as error:
-            raise disk_error(self.folder, error, "a checkpoint cannot be written") from None
+        with disk_errors(self.folder, "a checkpoint cannot be written"), whole():
+            self.folder.mkdir(exist_ok=True)
+            for abandoned in self.folder.glob(".partial-*"):  # of killed runs: --out is locked
+                shutil.rmtree(abandoned)
+            text = json.dumps(manifest | {"manifest_sha256": manifest_digest(manifest)})
+            write_folder(path, [(STATE, content), (MANIFEST, text.encode())])
+            for old in list(self._names())[KEPT:]:
+                remove_folder(self.folder / old)
 
     def load(self, notice: Callable[[str], None]) -> Checkpoint:
         """Return the newest checkpoint that is whole.

@@ -1,7 +1,8 @@
 """The one error a user can cause, and the exit codes that tell schedulers the truth."""
 
 import errno
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
 
@@ -154,3 +155,12 @@ def disk_error(where: str | Path, error: OSError, what: str = "cannot be written
         advice = "was the folder removed or replaced meanwhile?"
     why = error.strerror or str(error)
     return InputError(where, f"{what} ({why})", advice, ExitCode.RESOURCES)
+
+
+@contextmanager
+def disk_errors(where: str | Path, what: str = "cannot be written") -> Iterator[None]:
+    """Let an `OSError` in the block be a `disk_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise disk_error(where, error, what) from error

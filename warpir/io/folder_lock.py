@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.errors import ExitCode, InputError, disk_errors
 
 _CONTENT = re.compile(rb"(?:[0-9]+ on [^\n]*\n?)?")
 """What a lock file holds; empty while it is being written."""
@@ -34,14 +34,12 @@ class FolderLock:
             InputError: Another process holds it, or the file is not a lock (exit 7), or it cannot
                 be written (exit 5).
         """
-        try:
+        with disk_errors(self.path):
             lock = self._take_file()
             self._descriptor = lock
             os.lseek(lock, 0, os.SEEK_SET)
             os.ftruncate(lock, 0)
             os.write(lock, f"{os.getpid()} on {socket.gethostname()}\n".encode())
-        except OSError as error:
-            raise disk_error(self.path, error) from error
 
     def _take_file(self) -> int:
         """Return a descriptor of the lock file with the lock on it."""

@@ -22,7 +22,7 @@ import numpy as np
 from warpir.core import signals
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.atomic import sha256_of, sync, write_staged
-from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.errors import ExitCode, InputError, disk_error, disk_errors
 from warpir.core.memory import core_count
 from warpir.core.strict_json import json_bytes
 from warpir.io.folder_lock import FolderLock, make_folder, no_folder
@@ -125,7 +125,7 @@ class OutputFolder:
             InputError: As on entering the block.
         """
         self._refuse_name()
-        try:
+        with disk_errors(self.path):
             nearest = self.path.absolute()
             while not _is_there(nearest):
                 nearest = nearest.parent
@@ -137,8 +137,6 @@ class OutputFolder:
                 self._lock.refuse_held()
                 self._refuse_links()
                 self._refuse_results()
-        except OSError as error:
-            raise disk_error(self.path, error) from error
 
     def supersede(self, folder: Path) -> None:
         """Remove a folder as soon as the results are in place; until then it is needed."""
@@ -164,11 +162,9 @@ class OutputFolder:
         if not PLAIN_NAME.fullmatch(name):
             raise ValueError(f"not a plain file name: {name!r}")
         path = self.staging / name
-        try:
+        with disk_errors(self.path / name):
             path.parent.mkdir(exist_ok=True)
             write_staged(path, content)
-        except OSError as error:
-            raise disk_error(self.path / name, error) from error
         hashes = getattr(self._of_writer, "hashes", self._hashes)
         if hashes is not self._hashes:
             signals.check()  # a signal interrupts the main thread only, which waits for this one
@@ -219,12 +215,10 @@ class OutputFolder:
         folder = NEW_PREVIEWS if is_new or (self.path / NEW_PREVIEWS).is_dir() else PREVIEWS
         path = self.path / folder / f"preview-{step:06d}.png"
         staged = self.staging / path.name
-        try:
+        with disk_errors(path):
             path.parent.mkdir(exist_ok=True)
             write_staged(staged, writers.png_bytes(codes, icc, level=1))
             os.replace(staged, path)
-        except OSError as error:
-            raise disk_error(path, error) from error
         return path
 
     def write_exr(
@@ -343,10 +337,8 @@ class OutputFolder:
                 what = "a link in place of a folder of its own"
                 raise InputError(target.parent, what, "remove it", ExitCode.RESOURCES)
         for name, digest in self._hashes.items():
-            try:
+            with disk_errors(self.staging / name):
                 found = sha256_of(self.staging / name)
-            except OSError as error:
-                raise disk_error(self.staging / name, error) from error
             if found != digest:
                 what = "changed by somebody else before the run was complete"
                 raise InputError(self.staging / name, what, code=ExitCode.RESOURCES)
@@ -365,13 +357,11 @@ class OutputFolder:
         old = unchanged_files(self.path / RUN_JSON, self.path)
         leftover = [name for name in old if name not in self._hashes]
         run = {**self._run, "files": dict(self._hashes)}
-        try:
+        with disk_errors(self.path / "results"):
             write_staged(self.staging / RUN_JSON, json_bytes(run, _plain))
             for folder in {(self.staging / name).parent for name in names} | {self.staging}:
                 sync(folder)
             self._put_in_place(names, leftover)
-        except OSError as error:
-            raise disk_error(self.path / "results", error) from error
         for folder in self._superseded:
             with suppress(OSError):  # nothing but room is lost when it stays
                 remove_unfinished(folder)

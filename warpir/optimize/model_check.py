@@ -21,7 +21,7 @@ from torch import Tensor
 from warpir.app.config import InsertConfig
 from warpir.app.record import versions
 from warpir.core.atomic import write_file
-from warpir.core.errors import disk_error
+from warpir.core.errors import disk_errors
 from warpir.core.strict_json import json_bytes
 from warpir.diffusion.crop import Crop
 from warpir.diffusion.guidance import Guidance
@@ -346,7 +346,5 @@ def write_report(path: str, report: Report) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    try:
+    with disk_errors(path):
         write_file(Path(path), json_bytes(report.record()))
-    except OSError as error:
-        raise disk_error(path, error) from None

@@ -9,7 +9,7 @@ from typing import Any
 from warpir.app.config import InsertConfig
 from warpir.app.record import name_of
 from warpir.core.atomic import write_file
-from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.errors import ExitCode, InputError, disk_errors
 from warpir.core.signals import whole
 from warpir.core.strict_json import read_json_object
 from warpir.report.facts import in_words, without_folders
@@ -63,11 +63,8 @@ def write_sequence_report(config: InsertConfig, frames: Sequence[Frame]) -> None
         frames=[_card(frame, k % every == 0) for k, frame in enumerate(frames)],
     )
     path = config.output.folder / PAGE
-    try:
-        with whole():
-            write_file(path, content)
-    except OSError as error:
-        raise disk_error(path, error) from error
+    with disk_errors(path), whole():
+        write_file(path, content)
 
 
 def _card(frame: Frame, has_picture: bool) -> dict[str, Any]:
