@@ -622,7 +622,9 @@ def diffuse_albedo(cos_o: float, f0: float, count: int = 256) -> float:
     return float(2.0 * np.sum(ring * cos_i * weight))
 
 
-def gltf_albedo(cos_o: float, base_color: float, metallic: float, roughness: float) -> float:
+def gltf_albedo(
+    cos_o: float, base_color: float, metallic: float, roughness: float, count: int = 1024
+) -> float:
     """Return the directional albedo of :func:`gltf_brdf` for one channel, by quadrature.
 
     Exceeds 1 for a bright dielectric at grazing angles: the diffuse term is weighted by
@@ -631,7 +633,7 @@ def gltf_albedo(cos_o: float, base_color: float, metallic: float, roughness: flo
     """
     f0 = DIELECTRIC_F0 + (base_color - DIELECTRIC_F0) * metallic
     diffuse = (1.0 - metallic) * base_color * diffuse_albedo(cos_o, DIELECTRIC_F0)
-    return diffuse + specular_albedo(cos_o, float(ggx_alpha(roughness)), f0)
+    return diffuse + specular_albedo(cos_o, float(ggx_alpha(roughness)), f0, count)
 
 
 # ------------------------------------------------------------------------- tone mapping

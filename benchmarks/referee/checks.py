@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks import furnace
 from benchmarks.referee.subjects import sphere, square, sun_and_sky, view
+from tests.oracles import gltf_albedo
 from warpir.core.arrays import FloatArray
 
 from benchmarks.referee import __main__ as referee  # isort: skip  (sets the variant)
@@ -168,7 +168,7 @@ def check_material(rng: np.random.Generator) -> None:
             check_sampling(f"material: {name}", bsdf, si)
             found, spread = energy_by_sampler(bsdf, si, rng.random((3, count), dtype=np.float32))
             # In closed form, or by uniform directions where there is none.
-            expected = furnace.directional_albedo(np.cos(polar), roughness, 0.8, metallic)
+            expected = gltf_albedo(np.cos(polar), 0.8, metallic, roughness)
             if mapped:
                 u = rng.random((2, count), dtype=np.float32)
                 expected, other = energy_by_uniform(bsdf, si, u)
@@ -240,7 +240,7 @@ def check_energy() -> None:
         inside = closest < 0.7
         cos_o = np.sqrt(1.0 - closest[inside] ** 2)
         grid = np.linspace(0.6, 1.0, 41)
-        table = [furnace.directional_albedo(c, roughness, 1.0, metallic) for c in grid]
+        table = [gltf_albedo(c, 1.0, metallic, roughness, 512) for c in grid]
         expected = np.interp(cos_o, grid, table)
         error = float(np.sqrt(found.variance[inside][:, 0].sum())) / inside.sum()
         name = f"furnace: sphere, roughness {roughness}, metallic {metallic}"
