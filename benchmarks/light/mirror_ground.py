@@ -24,6 +24,7 @@ import numpy as np
 
 from benchmarks.measure import flags, write_json
 from benchmarks.scenes import panoramas_of
+from tests.oracles import fresnel
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import expose, gamma_to_linear
 from warpir.core.errors import InputError
@@ -120,9 +121,7 @@ def coat_light(texels: FloatArray, rays: Float64Array, roughness: float, seed: i
         mirrored = rays + 2.0 * facing[:, None] * half
         seen = (facing > 0.0) & (mirrored[:, 1] > 0.0)
         c = np.clip(facing, 1e-6, 1.0)
-        inside = np.sqrt(1.0 - (1.0 - c**2) / 1.5**2)
-        s, p = (c - 1.5 * inside) / (c + 1.5 * inside), (1.5 * c - inside) / (1.5 * c + inside)
-        weight = 0.5 * (s**2 + p**2) * masking(out) * masking(mirrored[:, 1])
+        weight = fresnel(c, 1.5) * masking(out) * masking(mirrored[:, 1])
         weight = np.where(seen, weight * c / (out * half[:, 1]), 0.0)
         light += weight[:, None] * look_up(texels, mirrored)
     return light / NORMALS
@@ -132,10 +131,7 @@ def coated(
     radiance: Float64Array, texels: FloatArray, camera: Camera, roughness: float, seed: int
 ) -> Float64Array:
     """Return what the camera sees when the ground has a coat, shape [H, W, 3]."""
-    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    rays = np.stack([u - camera.cx, camera.cy - v, np.full_like(u, -camera.fx)], -1)
-    rays = rays @ camera.c2w[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = camera.pixel_rays()
     below = rays[..., 1] < -0.03
     shown = radiance.copy()
     shown[below] *= LEFT

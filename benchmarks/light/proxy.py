@@ -21,7 +21,6 @@ import numpy as np
 
 from benchmarks.measure import flags
 from benchmarks.scenes import on_the_ground, photo_of, write_picture
-from tools.demo.make import pixel_directions
 from tools.demo.textures import paving_texture
 from warpir.core.arrays import Float64Array, FloatArray, PixelArray, mask_box
 from warpir.core.color import linear_to_gamma
@@ -117,13 +116,13 @@ def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
 def photograph(asset: Asset, camera: Camera, texels: FloatArray, samples: int) -> PixelArray:
     """Return the place's linear radiance as Mitsuba path-traces it, the sky behind it."""
     shot = foreground(Setting(asset, np.eye(4), camera, texels), DEPTH, samples, 0)
-    sky = look_up(texels, pixel_directions(camera))
+    sky = look_up(texels, camera.pixel_rays())
     return np.asarray(shot.mean + (1.0 - shot.coverage)[..., None] * sky)
 
 
 def painted_mask(wall: ReceiverMesh, camera: Camera, sun: Float64Array) -> FloatArray:
     """Return what a user would paint: ground that the wall keeps from the sun's centre."""
-    rays = pixel_directions(camera).reshape(-1, 3)
+    rays = camera.pixel_rays().reshape(-1, 3)
     eye = np.broadcast_to(camera.c2w[:3, 3], rays.shape)
     to_wall = first_hit(wall, eye, rays)[0]
     to_ground = np.where(rays[:, 1] < 0.0, -eye[:, 1] / np.minimum(rays[:, 1], -1e-9), np.inf)

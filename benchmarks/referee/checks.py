@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.referee.subjects import sphere, square, sun_and_sky, view
-from tests.oracles import gltf_albedo
+from tests.builders import shapes
+from tests.oracles import bilinear_lookup, gltf_albedo, latlong_uv, rectangle_ratio
 from warpir.core.arrays import FloatArray
 
 from benchmarks.referee import __main__ as referee  # isort: skip  (sets the variant)
@@ -41,25 +42,16 @@ def report(name: str, value: float, expected: float, error: float) -> None:
 def check_light(rng: np.random.Generator) -> None:
     """Match the bilinear formula in float64; sample it with the density stated."""
     texels = sun_and_sky(rng)
-    rows, columns = texels.shape[:2]
     emitter = LatlongEmitter(texels)
     directions = rng.normal(size=(100000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    u = np.mod(np.arctan2(directions[:, 0], -directions[:, 2]) / (2.0 * np.pi), 1.0)
-    v = np.arccos(directions[:, 1]) / np.pi
-    x, y = u * columns - 0.5, np.clip(v * rows - 0.5, 0.0, rows - 1.0)
-    j, i = np.floor(x).astype(int), np.floor(y).astype(int)
-    a, b = (x - j)[:, None], (y - i)[:, None]
-    k = np.minimum(i + 1, rows - 1)
-    upper, lower = (
-        texels[row, j % columns] * (1 - a) + texels[row, (j + 1) % columns] * a for row in (i, k)
-    )
-    truth = upper * (1 - b) + lower * b
+    truth = bilinear_lookup(texels, latlong_uv(directions))
     toward = mi.Vector3f(directions.T.astype(np.float32))
     found = np.asarray(emitter.radiance(toward, mi.Bool(True))).T
     # One float32 rounding of u moves the reading by 6e-8 of a slope of peak * columns
+    rounding = 6e-8 * texels.shape[1]
     error = np.abs(found - truth).max() / texels.max()
-    report("light: largest difference to bilinear float64, of peak", error, 0.0, 6e-8 * columns)
+    report("light: largest difference to bilinear float64, of peak", error, 0.0, rounding)
 
     # Without the sun, whose density the test's own quadrature cannot integrate
     emitter = LatlongEmitter(rng.exponential(size=(8, 16, 3)).astype(np.float32) ** 3)
@@ -225,17 +217,12 @@ def check_energy() -> None:
     """Match the float64 energy of the material per angle on a sphere under uniform light."""
     texels = np.ones((8, 16, 3), dtype=np.float32)
     camera = view(6.0)
-    rows, columns = np.mgrid[0:32, 0:32]
     cases = ((0.2, 0.0), (0.7, 0.0), (1.0, 1.0), (0.0, 1.0))
     for seed, (roughness, metallic) in enumerate(cases):
         asset = sphere(Material(metallic=metallic, roughness=roughness), rings=256)
         found = mitsuba_render.foreground(Setting(asset, np.eye(4), camera, texels), 1, 512, seed)
         # Angle at the centre of each pixel well inside the disc; E is smooth there
-        x = (columns + 0.5 - camera.cx) / camera.fx
-        y = (rows + 0.5 - camera.cy) / camera.fy
-        d = np.stack([x, y, np.ones_like(x)], axis=-1)
-        d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        along = 6.0 * d[..., 2]
+        along = -6.0 * camera.pixel_rays()[..., 2]
         closest = np.sqrt(np.maximum(36.0 - along**2, 0.0))
         inside = closest < 0.7
         cos_o = np.sqrt(1.0 - closest[inside] ** 2)
@@ -370,19 +357,10 @@ def check_shadow() -> None:
     """Match the configuration factor of a square over a plane; 1 where nothing is blocked."""
     texels = np.ones((8, 16, 3), dtype=np.float32)
     height, half = 1.0, 0.75
-    focal = 2000.0
     # Look at the point under the square's centre, from the side
-    c2w = np.eye(4)
-    c2w[:3, :3] = [
-        [1.0, 0.0, 0.0],
-        [0.0, np.cos(0.1), np.sin(0.1)],
-        [0.0, -np.sin(0.1), np.cos(0.1)],
-    ]
-    c2w[:3, 3] = [0.0, 6.0 * np.sin(0.1), 6.0 * np.cos(0.1)]
-    camera = Camera(8, 8, focal, focal, 4.0, 4.0, c2w)
-    side = half / height
-    root = np.sqrt(1.0 + side**2)
-    factor = 4.0 / (2.0 * np.pi) * 2.0 * side / root * np.arctan(side / root)
+    eye = (0.0, 6.0 * np.sin(0.1), 6.0 * np.cos(0.1))
+    camera = shapes.camera(8, 8, 2000.0, eye, -np.degrees(0.1))
+    factor = 1.0 - float(rectangle_ratio(0.0, 0.0, height, half))
     for name, material, expected in (
         ("opaque, single-sided from below", Material(), 1.0 - factor),
         ("blend, alpha 0.5", Material(alpha=0.5, alpha_mode="BLEND"), 1.0 - 0.5 * factor),

@@ -20,7 +20,6 @@ from benchmarks.referee.sheet import compare_runs
 from benchmarks.referee.subjects import ball, from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
 from tests.builders.shapes import all_pixels
-from tools.demo.make import pixel_directions
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
 from warpir.render.device_light import light_args
@@ -166,7 +165,7 @@ def ours(case: Case, view: Camera, depth: int, spp: int, is_ground: bool) -> Run
 
 def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
     """Return False in pixels that Mitsuba's spheres may cover, shape [H, W, 1]."""
-    rays = pixel_directions(view)
+    rays = view.pixel_rays()
     clear = np.ones((view.height, view.width, 1), bool)
     for lamp in lamps:
         if isinstance(lamp, SphereLamp):

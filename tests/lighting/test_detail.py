@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.builders.shapes import view_rays
 from warpir.core.latlong import map_directions
 from warpir.evaluate.scenes import crop_camera, crop_radiance
 from warpir.lighting.detail import HEIGHT, seen_from, with_detail
@@ -50,11 +51,7 @@ def test_photo_that_was_made_smaller_is_not_made_smaller_again() -> None:
 def test_the_ground_is_seen_where_it_lies() -> None:
     """A chequered plane, painted into the photo, is seen from the object as the same plane."""
     camera = camera_from_fov(640, 480, 60.0, -20.0, 1.6)
-    v, u = np.mgrid[0:480, 0:640] + 0.5
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, -(v - camera.cy) / camera.fy, -np.ones_like(u)], -1
-    )
-    rays = rays @ camera.c2w[:3, :3].T
+    rays = view_rays(camera).reshape(480, 640, 3)
     t = np.where(rays[..., 1] < -1e-3, 1.6 / np.maximum(-rays[..., 1], 1e-3), 0.0)
     point = camera.c2w[:3, 3] + t[..., None] * rays
     photo = np.where(t[..., None] > 0.0, 0.5 + 0.4 * np.sin(2.0 * point), 0.0).astype(np.float32)

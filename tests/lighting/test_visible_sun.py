@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.builders.shapes import a_regression, box_before, even_ambient
+from tests.builders.shapes import a_regression, box_before, even_ambient, view_rays
 from warpir.app.config import InsertConfig
 from warpir.core.color import luminance
 from warpir.lighting import estimate
@@ -53,12 +53,7 @@ def regression_of(seed: int | None = None) -> Regression:
 
 
 def rays_of(camera: Camera) -> NDArray[np.float64]:
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    local = np.stack(
-        [(u - camera.cx) / camera.fx, (camera.cy - v) / camera.fy, -np.ones_like(u)], -1
-    )
-    rays: NDArray[np.float64] = local @ camera.c2w[:3, :3].T
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return view_rays(camera).reshape(camera.height, camera.width, 3)
 
 
 def photo_of(radiance: NDArray[np.float64]) -> Picture:

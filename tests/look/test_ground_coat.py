@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.builders.shapes import view_rays
+from tests.oracles import fresnel
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import gamma_to_linear
 from warpir.demo import CAMERA, PHOTO, WET_PHOTO, WET_ROUGHNESS
@@ -34,10 +36,7 @@ def stripes(seed: int) -> Pattern:
 def view(pitch: float = -5.0) -> tuple[Camera, Float64Array]:
     """A camera, and the unit directions of its pixels."""
     camera = camera_from_fov(360, 240, 65.0, pitch, EYE)
-    v, u = np.mgrid[:240, :360] + 0.5
-    rays = np.stack([u - camera.cx, camera.cy - v, np.full_like(u, -camera.fx)], -1)
-    rays = rays @ camera.c2w[:3, :3].T
-    return camera, rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return camera, view_rays(camera).reshape(240, 360, 3)
 
 
 def on_ground(rays: Float64Array) -> tuple[Float64Array, Float64Array, BoolArray]:
@@ -72,13 +71,11 @@ def scene(
             far = (-WALL - at_z) / np.minimum(out[:, 2], -1e-9)
             seen = wall(at_x + far * out[:, 0], far * out[:, 1])
             c = np.clip(facing, 0.0, 1.0)
-            t = np.sqrt(1.0 - (1.0 - c**2) / 2.25)
-            s, p = (c - 1.5 * t) / (c + 1.5 * t), (1.5 * c - t) / (1.5 * c + t)
             masked = np.ones(len(ray))
             for cos in (-ray[:, 1], out[:, 1]):
                 tan2 = 1.0 / np.maximum(cos, 1e-4) ** 2 - 1.0
                 masked = masked * 2.0 / (1.0 + np.sqrt(1.0 + roughness**4 * tan2))
-            weight = 0.5 * (s**2 + p**2) * masked * c / (-ray[:, 1] * cos_half)
+            weight = fresnel(c) * masked * c / (-ray[:, 1] * cos_half)
             light += np.where((facing > 0.0) & (out[:, 1] > 0.0), weight * seen, 0.0)
         ground = ground + strength * light / count
     photo[is_ground] = ground

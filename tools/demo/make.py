@@ -26,7 +26,6 @@ from warpir.core.color import codes_of, linear_to_gamma
 from warpir.core.latlong import look_up
 from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO, WET_PHOTO
 from warpir.io.gltf.writer import write_glb
-from warpir.scene.camera import Camera
 
 DEPTH = 4
 """Surface hits of a light path in the photo."""
@@ -64,14 +63,6 @@ def write_light(texels: NDArray[np.float32], path: Path) -> None:
         copyfile(Path(folder) / "light" / path.name, path)
 
 
-def pixel_directions(view: Camera) -> NDArray[np.float64]:
-    """Return unit directions through the pixel centres, world frame, shape [H, W, 3]."""
-    v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
-    world = view.toward(u, v) @ view.c2w[:3, :3].T
-    directions: NDArray[np.float64] = world / np.linalg.norm(world, axis=2, keepdims=True)
-    return directions
-
-
 def render(
     with_car: bool, is_wet: bool, samples: int, device: str | None, seed: int = 0
 ) -> NDArray[np.float32]:
@@ -107,7 +98,7 @@ def render(
     shape = (view.height, view.width, -1)
     radiance = without_fireflies(np.stack([b.radiance for b in batches])).reshape(shape)
     empty = 1.0 - np.mean([b.mask for b in batches], axis=0).reshape(shape)
-    picture = radiance + empty * look_up(sky(FINE_SKY), pixel_directions(view))
+    picture = radiance + empty * look_up(sky(FINE_SKY), view.pixel_rays())
     return np.asarray(picture, dtype=np.float32)
 
 

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import TypeVar
 
@@ -99,14 +99,8 @@ def crop_radiance(texels: FloatArray, camera: Camera, side: int = 2) -> Float64A
     """
     step = (np.arange(side) + 0.5) / side
     total = np.zeros((camera.height, camera.width, 3))
-    for offset_v in step:
-        for offset_u in step:
-            u, v = np.meshgrid(
-                np.arange(camera.width) + offset_u, np.arange(camera.height) + offset_v
-            )
-            directions = camera.toward(u, v) @ camera.c2w[:3, :3].T
-            directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-            total += look_up(texels, directions)
+    for v, u in product(step, step):
+        total += look_up(texels, camera.pixel_rays(u, v))
     return total / side**2
 
 

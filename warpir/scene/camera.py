@@ -143,6 +143,12 @@ class Camera:
         y = (self.cy - np.asarray(v, np.float64)) / self.fy
         return np.stack([x, y, np.full_like(x, -1.0)], axis=-1)
 
+    def pixel_rays(self, u: float = 0.5, v: float = 0.5) -> Float64Array:
+        """Return unit directions through a place in every pixel, world frame, shape [H, W, 3]."""
+        columns, rows = np.meshgrid(np.arange(self.width) + u, np.arange(self.height) + v)
+        rays = self.toward(columns, rows) @ self.c2w[:3, :3].T
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
     def ray(self, u: float, v: float) -> tuple[Float64Array, Float64Array]:
         """Return origin [m] and unit direction, world frame, through pixel position (u, v)."""
         direction = self.c2w[:3, :3] @ self.toward(u, v)
