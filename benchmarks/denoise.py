@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.measure import flags, write_json
+from benchmarks.measure import flags, rms, write_json
 from benchmarks.scenes import panoramas_of, photo_of, places_of, renderer_of
 from warpir.core.arrays import FloatArray
 from warpir.evaluate.scenes import Subject
@@ -43,8 +43,7 @@ def measure(subject: Subject, reference: int) -> list[dict[str, float | str]]:
     shaded = (truth.layers.matte == 0.0) & (truth.layers.shadow_ratio.min(axis=-1) < 0.99)
 
     def error(picture: Picture, where: FloatArray) -> float:
-        difference = 255.0 * (picture.image - truth.image)[where]
-        return float(np.sqrt((difference**2).mean())) if where.any() else 0.0
+        return 255.0 * rms((picture.image - truth.image)[where]) if where.any() else 0.0
 
     insert(SAMPLES[0], 3, is_denoised=True)  # loads the network
     rows: list[dict[str, float | str]] = []

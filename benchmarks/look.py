@@ -21,13 +21,12 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy import ndimage
 
+from benchmarks.look_pair import blacks_and_contrast
 from benchmarks.measure import flags, write_json
 from benchmarks.response import LEVELS, codes_of, curve
 from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of, places_of, renderer_of
 from warpir.core.arrays import CodeArray, Float64Array, FloatArray
-from warpir.core.color import luminance
 from warpir.evaluate.image_errors import image_errors, make_regions
 from warpir.evaluate.scenes import Subject
 from warpir.io.images.jpeg import JpegCoding, read_coding
@@ -103,17 +102,6 @@ def jpeg_of(codes: CodeArray, quality: int) -> tuple[CodeArray, JpegCoding]:
     return coded, coding
 
 
-def laplacian(image: FloatArray, matte: FloatArray) -> float:
-    """Return the mean absolute Laplacian of the object, in codes."""
-    inside = ndimage.binary_erosion(matte > 0.99, iterations=1)
-    return float(np.abs(ndimage.laplace(255.0 * luminance(image)))[inside].mean())
-
-
-def blacks(image: FloatArray, matte: FloatArray) -> float:
-    """Return the 1st percentile of the object's luminance, in codes."""
-    return 255.0 * float(np.quantile(luminance(image)[matte > 0.99], 0.01))
-
-
 def draw_camera(
     photo_lin: FloatArray, rng: np.random.Generator, blur: tuple[float, float] = BLUR
 ) -> Shot:
@@ -160,17 +148,19 @@ def measure(subject: Subject, samples: int, columns: int) -> Errors:
     photo = photo_of(camera.shoot(place.photo_lin))
     coding = None if camera.quality is None else jpeg_of(photo.codes, camera.quality)[1]
     regions = make_regions(crisp.matte, crisp.shadow_ratio)
-    detail = laplacian(truth, crisp.matte)
+    inside = crisp.matte > 0.99
+    true_blacks, detail = blacks_and_contrast(truth, inside)
     positions = np.argwhere(crisp.matte > 0.0)[:, ::-1].astype(np.float64) + 0.5
     around = region_around(positions, *crisp.matte.shape)
 
     def errors(shown: FloatArray) -> dict[str, float]:
         of_box = image_errors(shown, truth, regions)["box"]
+        blacks, contrast = blacks_and_contrast(shown, inside)
         return {
             "rmse": of_box["rmse"],
             "flip": of_box.get("flip", float("nan")),
-            "laplacian": laplacian(shown, crisp.matte) / detail,
-            "blacks": blacks(shown, crisp.matte) - blacks(truth, crisp.matte),
+            "laplacian": contrast / detail,
+            "blacks": blacks - true_blacks,
         }
 
     found = {}

@@ -27,7 +27,7 @@ HALF_WIDTH = 400
 """Width of each half of the picture [px]."""
 
 
-def measure(image: FloatArray, where: BoolArray) -> tuple[float, float]:
+def blacks_and_contrast(image: FloatArray, where: BoolArray) -> tuple[float, float]:
     """Return blacks and fine contrast of some pixels of a display-encoded picture."""
     level = 255.0 * luminance(image)
     inside = ndimage.binary_erosion(where, iterations=1)
@@ -56,7 +56,7 @@ def main() -> None:
         ("object, all off", before, matte > 0.99),
         ("object, auto", after, matte > 0.99),
     ):
-        print("{:20s}  {:6.1f}  {:6.1f}".format(name, *measure(image, where)))
+        print("{:20s}  {:6.1f}  {:6.1f}".format(name, *blacks_and_contrast(image, where)))
     if options.jpeg:
         write_pair(options.jpeg, before, after, seen)
 

@@ -3,8 +3,6 @@
 import argparse
 import json
 import platform
-import resource
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
@@ -14,6 +12,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
+
+from warpir.core import memory
+from warpir.evaluate.results import commit
 
 PATHS = {"type": Path, "nargs": "+", "required": True}
 FOLDER = Path("../shared/data")
@@ -57,18 +58,13 @@ def seconds(work: Callable[[], object], device: wp.Device) -> tuple[float, float
 
 def peak_mib(device: wp.Device) -> float:
     """Return the peak memory of the process [MiB]: of the card on CUDA, else resident."""
-    if device.is_cuda:
-        return float(wp.get_mempool_used_mem_high(device)) / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return memory.peak_mib()["Warp on the GPU" if device.is_cuda else "host"]
 
 
 def context(device: wp.Device, threads: int) -> dict[str, Any]:
     """Return what a figure depends on besides the code."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    ).stdout.strip()
     return {
-        "commit": commit or "unknown",
+        "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),
         "device": device.name if device.is_cuda else platform.machine() + " CPU",
         "threads": threads if device.is_cpu else None,

@@ -24,6 +24,7 @@ from benchmarks.measure import flags
 from benchmarks.scenes import panoramas_of
 from warpir.calibration.not_pinhole import has_seam
 from warpir.core.arrays import FloatArray
+from warpir.core.color import codes_of
 from warpir.core.errors import InputError
 from warpir.evaluate.camera.measure import corrected_to_upright, even_cameras, photograph
 from warpir.train.camera.crops import DrawnCameras, draw_cameras, read_panoramas
@@ -89,7 +90,7 @@ def collage(
     sheet = Image.new("RGB", size, colour[int(rng.integers(3))])
     for left, top, right, bottom in cells(layout, size, gutter, rng):
         photo = photos[int(rng.integers(len(photos)))]
-        picture = Image.fromarray(np.round(255.0 * photo).astype(np.uint8))
+        picture = Image.fromarray(codes_of(photo))
         width, height = right - left, bottom - top
         factor = max(width / picture.width, height / picture.height) * rng.uniform(1.0, 1.3)
         shown = (width / factor, height / factor)

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import flags, write_json
+from benchmarks.measure import flags, rms, write_json
 from benchmarks.scenes import panoramas_of
 from tests.oracles import fresnel
 from warpir.core.arrays import Float64Array, FloatArray
@@ -170,9 +170,8 @@ def summary(results: list[Judged]) -> dict[str, Any]:
     for truth in ROUGHNESSES:
         of = [r for r in results if r.truth == truth]
         errors = [r.found.roughness - truth for r in of if r.found.roughness is not None]
-        rms = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
-        mean = float(np.mean(errors)) if errors else None
-        table[f"coated {truth}"] = [len(errors), len(of), mean, rms]
+        found = (float(np.mean(errors)), rms(errors)) if errors else (None, None)
+        table[f"coated {truth}"] = [len(errors), len(of), *found]
     return table
 
 

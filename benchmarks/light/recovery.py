@@ -22,6 +22,7 @@ from torch import Tensor
 
 from benchmarks.measure import context, flags, rms, table, write_json
 from benchmarks.scenes import on_the_ground, write_picture
+from tests.oracles import reinhard, spline
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import expose, gamma_to_linear, luminance
@@ -244,14 +245,8 @@ def _excess(
 
 def response(knots: Knots, radiance: Float64Array) -> Float64Array:
     """Return display-linear values of some radiances under Reinhard and a foreground curve."""
-    x, y, d = (k.detach().double().numpy()[0] for k in (knots.x, knots.y, knots.slope))
-    value = radiance / (1.0 + radiance)
-    k = np.clip(np.searchsorted(x, value, side="right") - 1, 0, len(x) - 2)
-    w, h = np.diff(x)[k], np.diff(y)[k]
-    q, m = (value - x[k]) / w, h / w
-    rise = m * q * q + d[k] * q * (1.0 - q)
-    shown: Float64Array = y[k] + h * rise / (m + (d[k + 1] + d[k] - 2.0 * m) * q * (1.0 - q))
-    return shown
+    parts = (k.detach().double().numpy()[0] for k in (knots.x, knots.y, knots.slope))
+    return spline(reinhard(radiance), *parts)[0]
 
 
 def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:

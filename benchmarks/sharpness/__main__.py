@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.look import draw_camera, softness
-from benchmarks.measure import flags
+from benchmarks.measure import flags, rms
 from benchmarks.scenes import is_for_fitting, panoramas_of
 from benchmarks.sharpness.fit import fit, shown_crop
 from warpir.core.arrays import BoolArray, FloatArray
@@ -108,10 +108,9 @@ def judge(name: str, samples: Iterator[Sample]) -> None:
     print(f"{name}: {len(rows)} photos, {told.mean():.0%} tell their blur")
     for low, high in [*itertools.pairwise(BINS), (BINS[0], BINS[-1])]:
         error = (estimate - true)[told & (true >= low) & (true < high)]
-        spread = float(np.sqrt(np.mean(error**2)))
         print(
             f"  {low:.1f} to {high:.1f} px: {len(error):4d}  bias {error.mean():+.2f}  "
-            f"mean error {np.abs(error).mean():.3f}  RMS {spread:.3f}"
+            f"mean error {np.abs(error).mean():.3f}  RMS {rms(error):.3f}"
         )
     grain, *guesses = 255.0 * np.array(grains).T
     guesses.append(np.median(grain))

@@ -540,7 +540,7 @@ def test_the_commit_is_this_checkouts_or_unknown(
 ) -> None:
     """A machine without git, and a package that is installed inside of another repository."""
     monkeypatch.setenv("PATH", "")
-    assert results._commit() == "unknown"
+    assert results.commit() == "unknown"
     monkeypatch.undo()
     installed = tmp_path / "venv" / "warpir"
     installed.mkdir(parents=True)
@@ -549,7 +549,7 @@ def test_the_commit_is_this_checkouts_or_unknown(
         subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
     for module in (warpir, results):
         monkeypatch.setattr(module, "__file__", str(installed / "results.py"))
-    assert results._commit() == "unknown"
+    assert results.commit() == "unknown"
 
 
 def test_a_panorama_that_all_networks_have_learned_from_is_named(

@@ -72,7 +72,7 @@ def run_record(
         "format": FORMAT,
         "version": VERSION,
         "warpir": warpir.__version__,
-        "commit": _commit(),
+        "commit": commit(),
         "versions": versions(),
         "device": bench.device,
         "date": time.strftime("%Y-%m-%d"),
@@ -106,7 +106,7 @@ def plain_values(value: Any) -> Any:
     return value if isinstance(value, bool | int | float | str | None) else str(value)
 
 
-def _commit() -> str:
+def commit() -> str:
     """Return the commit of this checkout; "unknown" for an installed package, or without git."""
     root = Path(warpir.__file__).parents[1]
     if not (root / ".git").exists() or shutil.which("git") is None:
