@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 from PIL import Image
 
+from tests.oracles import texel_direction
 from warpir.io.results import OutputFolder
 
 OIIO_TYPES = {"uint8": "uint8", "uint16": "uint16", "float16": "half", "float32": "float"}
@@ -73,21 +74,6 @@ def matrix_profile(primaries: str) -> bytes:
     return icc_profile(b"RGB ", tags)
 
 
-def directions(height: int) -> np.ndarray:
-    """Direction of each texel centre, written out from the convention sheet, [He, 2 He, 3]."""
-    width = 2 * height
-    u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-    lon, lat = np.pi * (1 - 2 * u), np.pi * (0.5 - v)
-    return np.stack(
-        [
-            np.sin(lon)[None] * np.cos(lat)[:, None],
-            np.repeat(np.sin(lat)[:, None], width, axis=1),
-            np.cos(lon)[None] * np.cos(lat)[:, None],
-        ],
-        axis=-1,
-    )
-
-
 LOBES = {  # one colour per horizontal axis: enough to tell turns and mirror images apart
     (1, 0, 0): (1.0, 0.0, 0.0),
     (-1, 0, 0): (0.0, 1.0, 1.0),
@@ -96,7 +82,9 @@ LOBES = {  # one colour per horizontal axis: enough to tell turns and mirror ima
 }
 
 
-def four_lobes(directions: np.ndarray) -> np.ndarray:
+def four_lobes(height: int) -> np.ndarray:
+    """The map of `LOBES` under a brighter sky, shape [height, 2 height, 3]."""
+    directions = texel_direction(height, 2 * height)
     texels = np.zeros(directions.shape, np.float32)
     for axis, rgb in LOBES.items():
         strength = np.exp(20.0 * (directions @ np.array(axis, float) - 1.0))[..., None]

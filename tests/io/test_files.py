@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from tests.builders.image_files import directions, four_lobes, matrix_profile
+from tests.builders.image_files import four_lobes, matrix_profile
 from warpir.core import color, signals
 from warpir.core.atomic import write_folder
 from warpir.core.errors import ExitCode, InputError
@@ -290,7 +290,7 @@ def test_png_round_trip(
 
 
 def test_envmap_files(tmp_path: Path) -> None:
-    texels = four_lobes(directions(32))
+    texels = four_lobes(32)
     texels[3, 5] = 2e5  # a sun above the half range
     with OutputFolder(tmp_path / "out") as out:
         out.write_envmap(texels)
@@ -397,7 +397,7 @@ def test_layers_of_others_are_refused(tmp_path: Path, rng: np.random.Generator) 
     layers, camera = small_layers(rng)
     with OutputFolder(tmp_path / "out") as out:
         write_layers(out, layers, camera)
-        out.write_envmap(four_lobes(directions(8)))
+        out.write_envmap(four_lobes(8))
     whole = (tmp_path / "out" / "layers.exr").read_bytes()
     (tmp_path / "half.exr").write_bytes(whole[: len(whole) // 2])
     for path, found in (
@@ -416,7 +416,7 @@ def test_layers_are_the_same_bytes_every_time(tmp_path: Path, rng: np.random.Gen
     for name in ("a", "b"):
         with OutputFolder(tmp_path / name) as out:
             write_layers(out, layers, camera)
-            out.write_envmap(four_lobes(directions(8)))
+            out.write_envmap(four_lobes(8))
     assert sha256s(tmp_path / "a") == sha256s(tmp_path / "b")
 
 
@@ -426,7 +426,7 @@ def test_e13_mitsuba_reads_what_is_written(tmp_path: Path, rng: np.random.Genera
     mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is not installed (extra bench)")
     mitsuba.set_variant("scalar_rgb")
     layers, camera = small_layers(rng)
-    texels = four_lobes(directions(16))
+    texels = four_lobes(16)
     texels[3, 5] = 2e5
     with OutputFolder(tmp_path / "out") as out:
         write_layers(out, layers, camera)

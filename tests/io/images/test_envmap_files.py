@@ -8,10 +8,11 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from tests.builders.image_files import LOBES, codes8, directions, four_lobes, write_image
+from tests.builders.image_files import LOBES, codes8, four_lobes, write_image
 from tests.builders.refusals import unreadable
 from tests.development_data import SHARED, needs_shared
 from tests.io.images.test_envmap_conventions import TOOLS
+from tests.oracles import texel_direction
 from warpir.core import color
 from warpir.core.errors import InputError
 from warpir.io.images.envmap_conventions import IN_CAMERA_AXES, SEAM_SHIFTS
@@ -24,12 +25,12 @@ def brightest(texels: np.ndarray, rgb: tuple[float, ...]) -> np.ndarray:
     """Direction in which the map shines most in one colour and least in the others."""
     score = texels @ (2 * np.array(rgb) - 1)
     row, column = np.unravel_index(int(score.argmax()), score.shape)
-    return directions(len(texels))[row, column]
+    return texel_direction(*texels.shape[:2])[row, column]
 
 
 @pytest.mark.parametrize("suffix", ["exr", "hdr"])
 def test_orientation_and_chirality(tmp_path: Path, suffix: str) -> None:
-    path = write_image(tmp_path / f"m.{suffix}", four_lobes(directions(32)))
+    path = write_image(tmp_path / f"m.{suffix}", four_lobes(32))
     texels = read_envmap(path)
     for axis, rgb in LOBES.items():
         assert brightest(texels, rgb) @ axis > 0.99
@@ -37,15 +38,16 @@ def test_orientation_and_chirality(tmp_path: Path, suffix: str) -> None:
         assert (mirrored @ axis > 0.99) == (axis[0] == 0)
     assert texels[0].mean() > texels[-1].mean()
     # As stated in words: centre +Z, left quarter +X.
-    np.testing.assert_allclose(directions(32)[15:17, 31:33].mean(axis=(0, 1)), [0, 0, 1], atol=0.01)
-    np.testing.assert_allclose(directions(32)[15:17, 15:17].mean(axis=(0, 1)), [1, 0, 0], atol=0.01)
+    of_texels = texel_direction(32, 64)
+    np.testing.assert_allclose(of_texels[15:17, 31:33].mean(axis=(0, 1)), [0, 0, 1], atol=0.01)
+    np.testing.assert_allclose(of_texels[15:17, 15:17].mean(axis=(0, 1)), [1, 0, 0], atol=0.01)
 
 
 @pytest.mark.parametrize("convention", sorted(SEAM_SHIFTS.keys() - IN_CAMERA_AXES))
 def test_foreign_conventions_by_their_own_formula(tmp_path: Path, convention: str) -> None:
     """Each texel is where the tool's formula looks for its direction."""
-    texels = four_lobes(directions(32))
-    u, v = TOOLS[convention](directions(32))
+    texels = four_lobes(32)
+    u, v = TOOLS[convention](texel_direction(32, 64))
     foreign = np.empty_like(texels)
     foreign[(v * 32).astype(int), (u % 1.0 * 64).astype(int)] = texels
     path = write_image(tmp_path / "m.exr", foreign)
