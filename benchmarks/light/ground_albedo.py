@@ -11,13 +11,12 @@ are fitted on the first, and the second says how far the level of the regressed 
 and after the ground is asked (`warpir.lighting.exposure`).
 """
 
-import json
 from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
-from benchmarks.measure import flags, rms
+from benchmarks.measure import flags, rms, write_json
 from benchmarks.scenes import panoramas_of, photo_of
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
@@ -143,8 +142,7 @@ def main() -> None:
     )
     describe(halves[0], "first half")
     describe(halves[1], "second half")
-    if options.json is not None:
-        options.json.write_text(json.dumps([[asdict(c) for c in half] for half in halves]))
+    write_json(options.json, [[asdict(c) for c in half] for half in halves], indent=None)
 
 
 if __name__ == "__main__":

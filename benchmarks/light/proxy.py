@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmarks.measure import flags
 from benchmarks.scenes import on_the_ground, photo_of, write_picture
+from tests.builders.shapes import box
 from tools.demo.textures import paving_texture
 from warpir.core.arrays import Float64Array, FloatArray, PixelArray, mask_box
 from warpir.core.color import linear_to_gamma
@@ -77,8 +78,6 @@ WALL_CENTRE, WALL_SIZE = np.array([0.6, 1.6, -9.2]), np.array([6.0, 3.2, 0.3])
 
 def ground_and_wall() -> tuple[Asset, Asset]:
     """Return the ground, and the wall that stands on it."""
-    from trimesh.creation import box
-
     paving = Material("paving", metallic=0.0, roughness=0.9, base_color_texture=TextureSlot(0))
     corners = GROUND * np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float64)
     uv = np.array([[0, 0], [8, 0], [8, 8], [0, 8]], np.float32)
@@ -86,12 +85,8 @@ def ground_and_wall() -> tuple[Asset, Asset]:
     ground = Asset(
         "ground", (Primitive(corners, sides, 0, uv0=uv),), (paving,), (paving_texture(512),)
     )
-    block = box(extents=WALL_SIZE)
     brick = Material("brick", (0.3, 0.14, 0.08), metallic=0.0, roughness=0.95)
-    primitive = Primitive(
-        np.array(block.vertices) + WALL_CENTRE, np.array(block.faces, np.int32), 0
-    )
-    return ground, Asset("wall", (primitive,), (brick,))
+    return ground, Asset("wall", (box(WALL_CENTRE, WALL_SIZE),), (brick,))
 
 
 def joined(parts: list[tuple[Asset, Float64Array]]) -> Asset:
