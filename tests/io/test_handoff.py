@@ -661,3 +661,35 @@ def test_mitsuba_renders_our_insertion_to_within_its_noise(folder: Path) -> None
 
 HALF_STEP = 2.5e-4
 """Half a step of half numbers below 1: what the layers are rounded to."""
+
+
+ON_A_SLOPE = """
+from dataclasses import replace
+import numpy as np
+from tests.builders.shapes import camera, quad
+from warpir.mitsuba.render import Setting, shadow_ratio
+from warpir.scene.asset import Asset, Material
+
+card = quad((0.0, 0.5, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0))
+asset = Asset("card", (card,), (Material(metallic=0.0, double_sided=True),))
+view = camera(16, 12, 24.0, (0.0, 3.0, 3.0), pitch=-45.0)
+texels = np.ones((8, 16, 3), np.float32)
+slope = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+slope *= np.linalg.det(slope)
+for turn in (np.eye(3), slope):
+    matrix, c2w = np.eye(4), view.c2w.copy()
+    matrix[:3, :3], c2w[:3] = turn, turn @ c2w[:3]
+    setting = Setting(asset, matrix, replace(view, c2w=c2w), texels)
+    ground = (*turn[:, 1], 0.0)
+    direct, whole = (shadow_ratio(setting, 1024, 1, ground, depth).mean for depth in (0, 2))
+    print((whole - direct).mean())
+"""
+
+
+@WITHOUT_MITSUBA
+@pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
+def test_mitsuba_throws_light_on_sloping_ground() -> None:
+    """Turned as a whole under an even sky, a card throws the same light on its ground."""
+    printed = output_of(sys.executable, "-c", ON_A_SLOPE, **{LIBRARY: str(llvm())})
+    level, sloping = map(float, printed.split()[-2:])
+    assert sloping == pytest.approx(level, rel=0.05)

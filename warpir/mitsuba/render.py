@@ -142,8 +142,9 @@ def build(
         to_plane = mi.ScalarTransform4f().look_at(
             origin=normal * offset, target=normal * (offset + 1.0), up=np.roll(normal, 1)
         )
+        # Not a rectangle: that is two triangles, whose corners round where they slope.
         parts["ground"] = {
-            "type": "rectangle",
+            "type": "disk",
             "to_world": to_plane @ mi.ScalarTransform4f().scale([horizon, horizon, 1.0]),
             "bsdf": _matt(albedo) if coat is None else _coat(coat),
         }
