@@ -693,3 +693,35 @@ def test_mitsuba_throws_light_on_sloping_ground() -> None:
     printed = output_of(sys.executable, "-c", ON_A_SLOPE, **{LIBRARY: str(llvm())})
     level, sloping = map(float, printed.split()[-2:])
     assert sloping == pytest.approx(level, rel=0.05)
+
+
+UNDER_A_TURNED_MAP = """
+from dataclasses import replace
+import numpy as np
+from tests.builders.shapes import camera, quad
+from warpir.mitsuba.render import Setting, foreground
+from warpir.scene.asset import Asset, Material, Texture, TextureSlot
+
+codes = np.array([[[220, 128, 200, 255]]], np.uint8)
+card = quad((0.0, 1.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0))
+card = replace(card, uv0=(card.positions[:, :2] * [1.0, -1.0]).astype(np.float32))
+leaning = Material(metallic=0.0, double_sided=True, normal_texture=TextureSlot(0))
+slot = TextureSlot(0, transform=(0.0, 1.0, 0.0, -1.0, 0.0, 0.0))
+# As rough as that no lobe is longer than wide
+brushed = replace(leaning, anisotropy=0.8, anisotropy_texture=slot)
+texels = np.ones((8, 16, 3), np.float32)
+texels[:, :4] = 20.0
+for material in (leaning, brushed):
+    asset = Asset("card", (card,), (material,), (Texture(codes),))
+    setting = Setting(asset, np.eye(4), camera(8, 8, 24.0, (0.0, 1.0, 3.0)), texels)
+    print(foreground(setting, 1, 256, 1).mean.mean())
+"""
+
+
+@WITHOUT_MITSUBA
+@pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
+def test_mitsuba_leans_a_normal_map_along_its_own_coordinates() -> None:
+    """A turned texture of anisotropy does not turn the normal map with it."""
+    printed = output_of(sys.executable, "-c", UNDER_A_TURNED_MAP, **{LIBRARY: str(llvm())})
+    plain, brushed = map(float, printed.split()[-2:])
+    assert brushed == pytest.approx(plain, rel=0.02)

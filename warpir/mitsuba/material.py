@@ -119,10 +119,10 @@ class GltfBSDF(mi.BSDF):
         self.m_components = [flags]
         self.m_flags = flags
         self.material = material
-        slots = {name: getattr(material, f"{name}_texture") for name in IS_COLOR}
+        textures = {name: getattr(material, f"{name}_texture") for name in IS_COLOR}
         self.images = {
             name: Image(asset.textures[slot.texture], slot, IS_COLOR[name])
-            for name, slot in slots.items()
+            for name, slot in textures.items()
             if slot is not None
         }
         has_sheen = max(material.sheen_color) > 0.0
@@ -131,19 +131,23 @@ class GltfBSDF(mi.BSDF):
         self.indices = mi.UInt32(wound(primitive, linear).astype(np.uint32).ravel())
         self.uvs = [_uploaded(uv) for uv in (primitive.uv0, primitive.uv1)]
         self.colors = _uploaded(primitive.colors)
-        self.vertex_tangents = self.face_tangents = None
-        names = ("anisotropy", "normal", "clearcoat_normal")
-        mapped = next((self.images[name].slot for name in names if name in self.images), None)
-        if mapped is None and material.anisotropy > 0.0:
-            mapped = TextureSlot(0)
-        if mapped is not None and primitive.tangents is not None:
+        self.vertex_tangents = None
+        self.face_tangents: dict[str, mi.Float] = {}
+        maps = ("normal", "clearcoat_normal", "anisotropy")
+        slots = {name: self.images[name].slot for name in maps if name in self.images}
+        if material.anisotropy > 0.0:
+            slots.setdefault("anisotropy", slots.get("normal", TextureSlot(0)))
+        if slots and primitive.tangents is not None:
             turned = primitive.tangents.astype(np.float64)
             turned[:, :3] = turned[:, :3] @ linear.T
             # A mirroring matrix turns the handedness of (n, t, b) around
             turned[:, 3] *= np.sign(np.linalg.det(linear))
             self.vertex_tangents = _uploaded(turned.astype(np.float32))
-        elif mapped is not None:
-            self.face_tangents = _uploaded(face_tangents(primitive, mapped, linear))
+        else:
+            self.face_tangents = {
+                name: _uploaded(face_tangents(primitive, slot, linear))
+                for name, slot in slots.items()
+            }
 
     def sample(
         self,
@@ -390,7 +394,7 @@ class GltfBSDF(mi.BSDF):
         if name not in self.images:
             return n
         texel = self._read(name, si, active) * 2.0 - 1.0
-        t, b, usable = self._tangents(n, si, active)
+        t, b, usable = self._tangents(name, n, si, active)
         mapped = (t * texel.x + b * texel.y) * scale + n * texel.z
         size = dr.norm(mapped)
         usable &= size > 1e-6
@@ -401,9 +405,9 @@ class GltfBSDF(mi.BSDF):
     ) -> tuple[mi.Frame3f, mi.Float]:
         """Frame about ``n`` whose x is the direction of anisotropy, and its strength, 0 without."""
         frame = mi.Frame3f(n)
-        if self.vertex_tangents is None and self.face_tangents is None:
+        if self.material.anisotropy <= 0.0:
             return frame, mi.Float(0.0)
-        t, b, usable = self._tangents(mi.Vector3f(si.sh_frame.n), si, active)
+        t, b, usable = self._tangents("anisotropy", mi.Vector3f(si.sh_frame.n), si, active)
         x, y = mi.Float(1.0), mi.Float(0.0)
         if "anisotropy" in self.images:
             texel = self._read("anisotropy", si, active) * 2.0 - 1.0
@@ -419,13 +423,16 @@ class GltfBSDF(mi.BSDF):
         return frame, dr.select(usable, strength, 0.0)
 
     def _tangents(
-        self, n: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+        self, name: str, n: mi.Vector3f, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Vector3f, mi.Bool]:
-        """Tangent and bitangent at right angles to ``n``, and whether they are known."""
+        """Tangent and bitangent of a map at right angles to ``n``, and whether they are known.
+
+        Those that the mesh lacks are along the map's own coordinates.
+        """
         if self.vertex_tangents is not None:
             tangent = self._interpolate(self.vertex_tangents, mi.Vector4f, si, active)
         else:
-            tangent = dr.gather(mi.Vector4f, self.face_tangents, si.prim_index, active)
+            tangent = dr.gather(mi.Vector4f, self.face_tangents[name], si.prim_index, active)
         t = mi.Vector3f(tangent.x, tangent.y, tangent.z)
         t = t - n * dr.dot(n, t)
         length = dr.norm(t)
