@@ -207,8 +207,8 @@ class RenderConfig:
     depth: int = option(5, "D", low=1, high=2**10)
     """Longest light path, in surface hits"""
     indirect_limit: float = option(8.0, "RADIANCE", low=0)
-    """Most radiance after a path's first bounce (0: any), less on dark ground; the limit removes
-    bright specks where a mirror throws sunlight"""
+    """Most radiance after a path's first bounce (0: any); the limit, lower for what is thrown onto
+    dark ground, removes bright specks where a mirror throws sunlight"""
     bounce: bool = option(True, expert=True)
     """Let the object throw light on the ground; what it reflects and emits there is in the shadow
     ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""
