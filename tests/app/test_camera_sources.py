@@ -1,6 +1,7 @@
 """Where the numbers of a photo's camera come from: flags, EXIF, a file, an estimate."""
 
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,9 @@ def test_nothing_given_is_estimated_and_said(folder: Path) -> None:
     assert numbers["principal"] == {"value": [0.5, 0.5], "sigma": None, "source": "assumed"}
     (line,) = [line for line in inputs.assumed if "estimated from the photo" in line]
     assert "pitch -9.0 +- 2.5, roll 2.0 +- 1.0, vertical field of view 40.0 +- 9.0" in line
+    (across,) = re.findall(r"degrees, horizontal ([\d.]+) \(", line)  # what --fov takes
+    again = read(folder, None, pitch=-9.0, roll=2.0, fov=float(across)).camera
+    assert again.fx == pytest.approx(inputs.camera.fx, rel=1e-3)
     assert any("1.6 m above the ground" in line for line in inputs.assumed)
     assert not any("level" in line or "60 degrees" in line for line in inputs.assumed)
     json.dumps(numbers)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from playwright.sync_api import Route
 
 from tests.builders.insertions import read_layers
 from tests.builders.programs.browser import Fingers, Opened, needs_chromium, open_browser
@@ -321,6 +322,29 @@ def test_what_is_typed_counts_before_what_follows(inputs: Path, tmp_path: Path) 
         assert page.input_value("#height") != "7"
         press(opened, "Control+z", "Control+z", "Control+z")
         assert page.evaluate(STATE)["size"] == 2.0
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: Path) -> None:
+    """The field counts the view across; an estimate is of the vertical one."""
+    with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
+
+        def estimate(route: Route) -> None:
+            start = route.fetch().json()
+            start["camera_numbers"]["vfov_deg"].update(sigma=10.0, source="estimate")
+            route.fulfill(json=start)
+
+        opened.page.route("**/start.json", estimate)
+        open_page(opened, served)
+        said = opened.page.inner_text("#camera-words")
+        camera = opened.page.evaluate(STATE)["camera"]
+        moved = [camera["height"] / 2.0 / camera["fy"] * side for side in (0.999, 1.001)]
+        vertical, across = (
+            np.diff(2.0 * np.arctan(np.array(moved) * aspect))[0]
+            for aspect in (1.0, WIDTH / HEIGHT)
+        )
+        assert said == f"Estimated from the photo: view ± {10.0 * across / vertical:.1f}°."
 
 
 @needs_chromium

@@ -217,6 +217,9 @@ def _about_sources(camera: Camera, seen_as: str) -> tuple[list[str], list[str]]:
     ]
     if estimated:
         line = f"estimated from the photo: {', '.join(shown)} degrees"
+        if "vfov_deg" in estimated:
+            across = math.degrees(2.0 * math.atan(camera.width / 2.0 / camera.fx))
+            line += f", horizontal {across:.1f}"
         if camera.sources["principal"].name == ESTIMATE:
             line += f", corrected to upright (optical axis at row {camera.cy:.0f})"
         assumed.append(f"camera {line} (--pitch, --roll, --horizon, --fov; --camera-from assume)")

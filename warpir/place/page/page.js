@@ -141,11 +141,12 @@ function showPanel() {
   if ($('light-words').textContent !== lighting.words) $('light-words').textContent = lighting.words;
 }
 
-// What of the camera is an estimate, and how far it may be off.
+// What of the camera is an estimate, and how far it may be off; the view across, as its field is.
 function estimated(numbers) {
-  const names = { pitch_deg: 'pitch', roll_deg: 'roll', vfov_deg: 'vertical view' };
+  const [across, upright] = [camera.width / camera.fx, camera.height / camera.fy].map((side) => Math.sin(2 * Math.atan(side / 2)));
+  const names = { pitch_deg: ['pitch', 1], roll_deg: ['roll', 1], vfov_deg: ['view', across / upright] };
   const parts = Object.entries(names).filter(([name]) => numbers[name].source === 'estimate')
-    .map(([name, word]) => `${word} ± ${plain(numbers[name].sigma, 1)}°`);
+    .map(([name, [word, factor]]) => `${word} ± ${plain(numbers[name].sigma * factor, 1)}°`);
   return parts.length ? `Estimated from the photo: ${parts.join(', ')}.` : '';
 }
 
