@@ -324,6 +324,12 @@ def test_what_is_typed_counts_before_what_follows(inputs: Path, tmp_path: Path) 
         assert page.evaluate(STATE)["size"] == 2.0
 
 
+NO_WEBGL = """const get = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : get.call(this, kind, ...more);
+};"""
+
+
 @needs_chromium
 @pytest.mark.slow
 def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: Path) -> None:
@@ -345,6 +351,18 @@ def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: P
             for aspect in (1.0, WIDTH / HEIGHT)
         )
         assert said == f"Estimated from the photo: view ± {10.0 * across / vertical:.1f}°."
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_tells_of_a_browser_that_cannot_draw(inputs: Path, tmp_path: Path) -> None:
+    with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
+        opened.page.add_init_script(NO_WEBGL)
+        opened.page.goto(served.address)
+        opened.page.wait_for_function(
+            "document.getElementById('loading').textContent.includes('cannot draw')"
+        )
+        assert "graphics acceleration" in opened.page.inner_text("#loading")
 
 
 @needs_chromium

@@ -15,7 +15,7 @@ import { View } from './view.js';
 const $ = (id) => document.getElementById(id);
 
 const start = await (await fetch('start.json')).json();
-export const stage = new Stage($('canvas'));
+export const stage = drawn();
 export let state;
 let spacing = 1;
 let isDue = false;
@@ -40,6 +40,16 @@ const history = new History({ camera, stance, stand, turn, size, light: lighting
     $('redo').disabled = !canRedo;
   },
 });
+// The stage, or why there is none: without it nothing here can be used.
+function drawn() {
+  try {
+    return new Stage($('canvas'));
+  } catch (error) {
+    $('loading').textContent = `This browser cannot draw the object: ${error.message} Turn on its graphics acceleration, or open the address in another one.`;
+    throw error;
+  }
+}
+
 // Whether the photo's own camera is level and yet sees the horizon off the middle.
 function looksUpright() {
   return Math.abs(stance.pitch) < 0.5 && Math.abs(camera.cy / camera.height - 0.5) > 0.02;
