@@ -21,7 +21,8 @@ import warpir.app.command
 import warpir.insert
 from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
-from warpir.app.config import EXCLUSIVE, OPTIONS, InsertConfig, flag
+from warpir.app.config import DEFAULTS, EXCLUSIVE, OPTIONS, InsertConfig, flag
+from warpir.app.config_file import ELSEWHERE
 from warpir.app.inputs import read_inputs
 from warpir.app.program import say
 from warpir.app.record import PATHS, RUN_FORMAT
@@ -370,6 +371,27 @@ def test_command_refuses_values(argv: list[str], where: str, words: str) -> None
     error = refused([*NEEDED, *argv])
     assert error.where == where
     assert words in error.what
+
+
+@pytest.mark.parametrize(
+    ("stray", "advice"),
+    [
+        ("--yaw", "did you mean --rotate-y?"),  # --at before
+        ("--height", "did you mean --camera-height?"),  # --weight before
+        ("--input", "did you mean --photo?"),  # --out before
+        ("--modle", "did you mean --model?"),
+        ("--quiet", "see --help"),  # --out before
+        ("610", "each value follows its flag, in quotes where it has spaces"),
+    ],
+)
+def test_advice_on_unknown_flags(stray: str, advice: str) -> None:
+    """Words of other programs lead to ours, likeness by chance to none."""
+    assert refused([*NEEDED, stray]).advice == advice
+
+
+def test_words_of_other_programs_lead_to_our_flags() -> None:
+    assert set(ELSEWHERE.values()) <= {flag(name)[2:] for name in DEFAULTS}
+    assert not set(ELSEWHERE) & {flag(name)[2:] for name in DEFAULTS}
 
 
 @pytest.mark.parametrize(("first", "second"), EXCLUSIVE)

@@ -259,7 +259,10 @@ def read_arguments(parser: argparse.ArgumentParser, argv: Sequence[str]) -> dict
         raise usage(error.argument_name or "command line", error.message) from None
     if unknown:
         known = [text for action in parser._actions for text in action.option_strings]
-        raise usage(unknown[0], "no such flag", closest(unknown[0].split("=")[0], known))
+        advice = closest(unknown[0].split("=")[0], known)
+        if not unknown[0].startswith("-"):
+            advice = "each value follows its flag, in quotes where it has spaces"
+        raise usage(unknown[0], "no such flag", advice)
     texts = vars(given)
     texts.pop("debug", None)
     return texts

@@ -21,6 +21,18 @@ YAML_SHARE = 256
 YAML = "tag:yaml.org,2002:"
 """Begins the tags of YAML's own types."""
 
+ELSEWHERE = {
+    "azimuth": "sun", "background": "photo", "cpu": "device", "elevation": "sun",
+    "envmap": "light", "gpu": "device", "hdri": "light", "height": "camera-height",
+    "image": "photo", "input": "photo", "mask": "occluder-mask", "mesh": "asset",
+    "object": "asset", "output": "out", "position": "at", "resolution": "width",
+    "rotate": "rotate-y", "rotation": "rotate-y", "spp": "samples", "turn": "rotate-y",
+    "yaw": "rotate-y",
+}  # fmt: skip
+"""Our flags, by what other programs call them."""
+ALIKE = 0.7
+"""From which likeness a name may be meant: at difflib's 0.6, --quiet was taken for --out."""
+
 
 def read_config_file(path: str, limits: Limits) -> dict[str, Any]:
     """Read the keys of a configuration file or the ``config`` of a ``run.json``.
@@ -172,6 +184,9 @@ def kind_of(value: Any) -> str:
 
 
 def closest(name: str, names: Sequence[str]) -> str:
-    """Return advice for a name that is none of ``names``."""
-    close = difflib.get_close_matches(name[:SHOWN], names, n=1)
-    return f"did you mean {close[0]}?" if close else "see --help"
+    """Return advice for a name that is none of ``names``: flags, or keys of a file."""
+    bare = {other.lstrip("-").replace("_", "-"): other for other in names}
+    asked = name[:SHOWN].lstrip("-").replace("_", "-").lower()
+    meant = ELSEWHERE.get(asked)
+    close = [meant] if meant in bare else difflib.get_close_matches(asked, bare, 1, ALIKE)
+    return f"did you mean {bare[close[0]]}?" if close else "see --help"
