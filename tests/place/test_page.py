@@ -355,6 +355,32 @@ def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: P
 
 @needs_chromium
 @pytest.mark.slow
+def test_page_that_is_loaded_again_goes_on(inputs: Path, tmp_path: Path) -> None:
+    """Whatever was placed, lit and painted is there again; undo leads to the page's start."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
+        page = opened.page
+        begun = page.evaluate(STATE)
+        enter(opened, "size", 1.25)
+        stage = box_of(opened, "#stage")
+        place = stage["x"] + 0.3 * stage["width"], stage["y"] + 0.2 * stage["height"]
+        for tool in ("#add-lamp", "#paint"):
+            page.click(tool)
+            page.mouse.click(*place)
+        settle(opened)
+        placed = page.evaluate(STATE)
+        assert len(placed["lamps"]) == len(placed["mask"]) == 1
+        save(opened)  # or the browser asks first
+        page.reload()
+        page.wait_for_selector("#save:not([disabled])", timeout=60_000)
+        settle(opened)
+        assert page.evaluate(STATE) == placed
+        page.click("#undo")
+        settle(opened)
+        assert page.evaluate(STATE) == begun
+
+
+@needs_chromium
+@pytest.mark.slow
 def test_page_tells_of_a_browser_that_cannot_draw(inputs: Path, tmp_path: Path) -> None:
     with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
         opened.page.add_init_script(NO_WEBGL)

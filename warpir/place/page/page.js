@@ -331,6 +331,29 @@ async function save() {
   $('save').disabled = false;
 }
 
+// A page that is loaded again, also by a browser that was short of memory, goes on where it was, by
+// a change that undo takes back. The address has the session's token, and storage may be refused.
+const KEPT = `placing ${location.pathname}`;
+
+function keep() {
+  try {
+    sessionStorage.removeItem(KEPT);
+    sessionStorage.setItem(KEPT, JSON.stringify({ state, isSaved: state === saved }));
+  } catch { /* a mask may be too much for it */ }
+}
+
+function goOn() {
+  try {
+    const kept = JSON.parse(sessionStorage.getItem(KEPT));
+    const first = (name) => (JSON.stringify(kept.state[name]) === JSON.stringify(state[name]) ? state : kept.state)[name];
+    if (kept && JSON.stringify(kept.state) !== JSON.stringify(state)) {
+      history.once('loaded again', () => ({ ...kept.state, camera: first('camera'), stance: first('stance') }));
+      if (kept.isSaved) saved = state;
+    }
+  } catch { /* then it begins anew */ }
+  for (const kind of ['visibilitychange', 'pagehide']) window.addEventListener(kind, keep);
+}
+
 window.addEventListener('beforeunload', (event) => {
   if (state !== saved) event.preventDefault();
 });
@@ -345,7 +368,9 @@ try {
   await stage.load('asset.glb', start.asset);
   $('loading').hidden = true;
   $('save').disabled = $('preview').disabled = $('insert').disabled = false;
+  view.show();
   new ResizeObserver(() => view.show()).observe($('room'));
+  goOn();
   warm(state);
   pictures.follow();
 } catch (error) {
