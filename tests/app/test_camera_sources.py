@@ -238,6 +238,9 @@ def test_estimate_that_sees_no_ground_gives_way_to_a_level_camera(
 def test_place_that_no_camera_sees_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="shows no ground"):
         read(folder, Asked(), at=(48.0, 1.0), camera_from="assume")
+    with pytest.raises(InputError) as refused:
+        read(folder, Asked(), at=(0.5, 0.8), camera_from="assume")
+    assert refused.value.advice == "give pixels of the photo, not shares of it"
     with pytest.raises(InputError, match="outside the photo"):
         read(folder, Asked(pitch_deg=50.0), at=(48.0, 500.0))
 

@@ -632,6 +632,8 @@ def test_M21_other_kinds_are_refused(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"asset{suffix}"
     path.write_bytes(b"x")
     fails(path, "convert it to GLB")
+    if suffix == ".zip":
+        fails(path, "unpack it and give its .glb or .gltf")
 
 
 @pytest.mark.parametrize("kind", ["glb", "base64", "bin"])

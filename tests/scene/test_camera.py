@@ -208,6 +208,7 @@ WRONG_FILES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "C9-comma": ('{\n"fx": 1,\n}', "json.syntax", {"line": 3}),
     "C9-list": ("[1, 2]", "json.not_an_object", {"found": "list"}),
     "C9-nested": ("[" * 100_000, "json.nesting", {"limit": 100}),
+    "photo": ("\xff\xd8\xff\xe0", "camera.kind", {"found": "a picture"}),
     "foreign": ('{"camera_angle_x": 1}', "camera.kind", {"found": "keys 'camera_angle_x'"}),
     "focal": (own(fx=-1.0), "camera.focal_length", {"pointer": "/fx", "found": -1.0}),
     "focal-bool": (own(fx=True), "camera.number", {"pointer": "/fx", "found": "True"}),

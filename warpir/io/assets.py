@@ -69,7 +69,8 @@ def _read(path: Path, missing_textures: str, limits: Limits) -> Asset:
         path,
         f"not a mesh that warpir reads (found {suffix or 'no extension'}; "
         "expected .glb, .gltf, .obj, .ply or .stl)",
-        "convert it to GLB",
+        ("unpack it and give its .glb or .gltf, or " if suffix == ".zip" else "")
+        + "convert it to GLB",
         reason="asset.kind",
         found=suffix,
     )

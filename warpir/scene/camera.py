@@ -440,10 +440,10 @@ def ground_point(
         raise InputError("--ground", "the plane passes through the camera")
     approach = float(normal @ direction) / length
     if approach * distance >= -1e-9 * abs(distance):
-        raise InputError(
-            "--at",
-            f"pixel ({u:g}, {v:g}) shows no ground: it lies at or above the horizon",
-            "choose a pixel lower in the image, or check the camera's pitch and field of view",
-        )
+        what = f"pixel ({u:g}, {v:g}) shows no ground: it lies at or above the horizon"
+        advice = "choose a pixel lower in the image, or check the camera's pitch and field of view"
+        if max(u, v) <= 1.0:
+            advice = "give pixels of the photo, not shares of it"
+        raise InputError("--at", what, advice)
     point: Float64Array = origin - direction * (distance / approach)
     return point

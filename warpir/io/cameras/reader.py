@@ -108,6 +108,10 @@ def _read(
         return read_exr_camera(path)
     if magic == b"glTF" or path.suffix.lower() == ".gltf":
         return read_gltf_camera(path, photo_size, frame, limits)
+    expected = "fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF"
+    if magic.startswith((b"\xff\xd8", b"\x89PNG")):
+        advice = "leave it out: of the photo the EXIF is read anyway"
+        raise CAMERA.error(path, "kind", found="a picture", expected=expected, advice=advice)
     content = read_json_object(path, limits)
     if "cameraTransform" in content or "cameraParameters" in content:
         return read_fspy(path, content)
@@ -120,7 +124,6 @@ def _read(
     if "fx" in content or "c2w" in content:
         return _read_own(path, content)
     keys = [shown(key) for key in list(content)[:8]]
-    expected = "fx fy cx cy w h c2w, or a file of fSpy, COLMAP, nerfstudio, Waymo or glTF"
     raise CAMERA.error(path, "kind", found=f"keys {', '.join(keys) or 'none'}", expected=expected)
 
 
