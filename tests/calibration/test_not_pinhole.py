@@ -10,7 +10,12 @@ from PIL import Image
 import warpir.demo
 from warpir.calibration import not_pinhole
 from warpir.calibration.estimate import NOT_PINHOLE_SIGMA_DEG, estimate_camera
-from warpir.calibration.not_pinhole import has_image_circle, has_seam, looks_like
+from warpir.calibration.not_pinhole import (
+    has_image_circle,
+    has_seam,
+    is_panorama,
+    looks_like,
+)
 from warpir.core.arrays import FloatArray
 from warpir.train.networks.calibrator import CalibratorConfig, random_calibrator
 
@@ -35,6 +40,19 @@ def side_by_side(gutter: int) -> FloatArray:
     """Return two pictures beside each other, of unequal width, with a white gutter [px]."""
     parts = [scene(1)[:, :200], np.ones((240, gutter, 3), np.float32), scene(2)]
     return np.concatenate(parts, axis=1)
+
+
+def test_whole_panorama_is_one() -> None:
+    """Its ends meet, its top row is one point; a part of the same shape is a photo."""
+    v, u = (np.mgrid[:256, :512] + 0.5) / 256.0 * math.pi
+    across, up, ahead = np.sin(v) * np.sin(u), np.cos(v), np.sin(v) * np.cos(u)
+    bands = [np.sin(5.0 * across + 2.0 * up), np.sin(7.0 * ahead + up), np.sin(4.0 * up)]
+    whole = (0.5 + 0.4 * np.stack(bands, axis=-1)).astype(np.float32)
+    assert "panorama, which --light takes" in looks_like(whole)
+    assert looks_like(np.roll(whole, 100, axis=1)) == looks_like(whole)
+    for part in (whole[:, :500], whole[64:192, 40:296], whole[:128, 40:296]):
+        assert looks_like(part) == ""
+    assert not is_panorama(scene(1, 160))
 
 
 @pytest.mark.parametrize("gutter", [0, 2, 9])

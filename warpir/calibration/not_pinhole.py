@@ -1,4 +1,4 @@
-"""Recognises pictures that no pinhole camera takes: circular fisheye pictures and collages.
+"""Recognises pictures that no pinhole camera takes: fisheyes, whole panoramas and collages.
 
 The network has never seen any and answers them as confidently as photos.
 """
@@ -30,6 +30,9 @@ MARGIN = 0.08
 """Share of the columns at either side in which no seam is looked for."""
 EVEN = 0.008
 """Largest difference along a border of one colour."""
+JOINED, POLE = 2.0, 0.3
+"""A panorama's ends differ by at most so many times what neighbouring columns do in the median; its
+top row is one point of the sky, and varies by at most this share of what the picture does."""
 
 
 def looks_like(photo: FloatArray) -> str:
@@ -40,6 +43,8 @@ def looks_like(photo: FloatArray) -> str:
     """
     if has_image_circle(photo):
         return "a circular fisheye picture"
+    if is_panorama(photo):
+        return "a 360-degree panorama, which --light takes,"
     return "a collage" if has_seam(photo) else ""
 
 
@@ -58,6 +63,21 @@ def has_image_circle(photo: FloatArray) -> bool:
         return False
     # JPEG leaves a code or two of noise in what was one colour.
     return bool(outside.std(axis=0).max() < 0.01 and rim.std(axis=0).max() > 0.05)
+
+
+def is_panorama(photo: FloatArray) -> bool:
+    """Tell whether a photo is twice as wide as high and goes on at its left where its right ends.
+
+    Args:
+        photo: Display-encoded in [0, 1], shape [H, W, 3].
+    """
+    height, width = photo.shape[:2]
+    if width != 2 * height or height < SHORTEST:
+        return False
+    grey = _averaged(_averaged(photo, 0, LONGEST // 2), 1, LONGEST).mean(axis=2)
+    steps = np.abs(np.diff(grey, axis=1, append=grey[:, :1])).mean(axis=0)
+    is_joined = steps[-1] < JOINED * np.median(steps)
+    return bool(is_joined and grey[0].std() < POLE * grey.std())
 
 
 def has_seam(photo: FloatArray) -> bool:
