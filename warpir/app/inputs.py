@@ -301,8 +301,8 @@ def _assumptions(
     yield from placement.assumed
     if shade is not None:
         yield (
-            f"{100.0 * shade.at_object:.0f} % of the lamps' light is kept from the object, the "
-            "mean of --shadow-mask under its footprint"
+            f"{100.0 * shade.at_object:.0f} % of the light of the sun and of far lamps is kept "
+            "from the object, the mean of --shadow-mask under its footprint"
         )
     if files.run is not None:
         assumption = files.run.assumption(world.camera.c2w, config.camera.file)
