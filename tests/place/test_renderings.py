@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.builders.programs.browser import needs_chromium
-from tests.builders.programs.placing import STATE, command, placing, press, settle
+from tests.builders.programs.placing import STATE, command, placing, press, save, settle
 from warpir.core.errors import InputError
 from warpir.place.renderings import Renderings, policy_of
 from warpir.place.worker import PATIENCE, Worker
@@ -184,6 +184,18 @@ def test_what_is_rendered_already_is_told(inputs: Path, tmp_path: Path) -> None:
         page.wait_for_selector("#cancel", state="hidden")
         assert page.locator("#picture").is_hidden()
         assert page.inner_text("#rendering-words") == ""
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_command_is_shown_for_what_was_saved_alone(inputs: Path, tmp_path: Path) -> None:
+    """Any change hides it, for it would render the placement before; undo shows it again."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
+        save(opened)
+        for key, is_shown in (("q", False), ("Control+z", True)):
+            opened.page.focus("#stage")
+            press(opened, key)
+            assert opened.page.locator("#done").is_visible() == is_shown
 
 
 @needs_chromium

@@ -149,6 +149,7 @@ function showPanel() {
   if (light.sky === 'custom' && !skies.querySelector('[value=custom]')) skies.append(new Option(start.sky instanceof Array ? 'Custom' : 'As estimated', 'custom'));
   skies.value = light.sky;
   if ($('light-words').textContent !== lighting.words) $('light-words').textContent = lighting.words;
+  $('done').hidden = !$('command').textContent || state !== saved;
 }
 
 // What of the camera is an estimate, and how far it may be off; the view across, as its field is.
@@ -312,14 +313,15 @@ let saved = state;
 
 function showSaved(sent, command) {
   $('command').textContent = command;
-  $('done').hidden = false;
   saved = sent;
+  draw();
 }
 
 async function save() {
   if ($('save').disabled) return;
   const sent = state;
   $('save').disabled = true;
+  $('command').textContent = '';
   $('problem').hidden = $('done').hidden = true;
   try {
     const { command } = await post('save', sentPlacement(sent));
