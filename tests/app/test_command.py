@@ -464,6 +464,16 @@ def test_config_file_gives_the_same_as_flags(tmp_path: Path) -> None:
     assert parse(["--config", str(other)]).config == expected
 
 
+def test_config_file_whose_paths_start_elsewhere_is_told_of(tmp_path: Path) -> None:
+    """As of a run.json that is used in its results' folder: its paths start where the run did."""
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({"photo": "p.png", "asset": "a.glb", "out": "o"}))
+    (notice,) = parse(["--config", str(path)]).notices
+    assert notice.startswith(f"p.png, named in {path}, is not in the folder where the command runs")
+    photo = ["--photo", "p.png"]
+    assert "a.glb, named in" in parse(["--config", str(path), *photo]).notices[-1]
+
+
 @pytest.mark.case("F2")
 def test_config_file_replays_a_run(tmp_path: Path) -> None:
     """``run.json`` of an earlier run is a configuration; an unknown layout is refused (F2)."""
@@ -512,10 +522,13 @@ def test_config_file_opens_no_network_and_no_pickle(tmp_path: Path, name: str) -
 
 
 @pytest.mark.case("F3")
-def test_config_file_yields_to_flags(tmp_path: Path) -> None:
+def test_config_file_yields_to_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A flag wins over the file, and says so (F3)."""
     path = tmp_path / "c.yaml"
     path.write_text(YAML)
+    monkeypatch.chdir(tmp_path)
+    for name in ("p.png", "a.glb"):
+        Path(name).touch()
     command = parse(["--config", str(path), "--samples", "8"])
     assert command.config.render.samples == 8
     assert len(command.notices) == 1 and "--samples" in command.notices[0]

@@ -5,6 +5,7 @@ so that ``--place -1,0,-3``, ``place: [-1, 0, -3]`` and ``"place": "-1,0,-3"`` m
 """
 
 import argparse
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +28,8 @@ from warpir.core.errors import InputError, raise_all, shown
 from warpir.core.limits import Limits
 from warpir.core.options import convert, help_of
 
+FROM_HERE = ("photo", "asset", "camera", "light", "lamps", "occluder_mask", "proxy", "reuse")
+"""What of a configuration file is looked for beside the command, for a notice where it is not."""
 HEADINGS = {
     "inputs": "inputs",
     "camera": "camera and ground",
@@ -108,6 +111,11 @@ def parse(argv: Sequence[str]) -> Command:
         for name in excluded
         if filed[name] != DEFAULTS[name]
     )
+    for file in (filed[name] for name in FROM_HERE if name in filed.keys() - texts.keys()):
+        if isinstance(file, str) and not os.path.isabs(file) and not os.path.exists(file):
+            what = f"{file}, named in {path}, is not in the folder where the command runs"
+            notices += (f"{what}, at which relative paths start",)
+            break
     config.require_inputs()
     return Command(config, validate, notices)
 
