@@ -1,6 +1,7 @@
 """Where the object stands: `warpir.scene.placement`."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -158,6 +159,19 @@ def test_placement_off_the_ground_is_set_on_it(camera: Camera, y: float) -> None
                         for z in (LOW[2], HIGH[2])])  # fmt: skip
     world = corners @ placed.asset_to_world[:3, :3].T + placed.asset_to_world[:3, 3]
     assert world[:, 1].min() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_place_that_is_moved_onto_the_ground_is_told(camera: Camera) -> None:
+    """The plane that the notice names carries the object where it was asked to stand."""
+    asked = 0.5, 0.75, -20.0
+    (notice,) = place_asset(LOW, HIGH, camera, place=asked, scale=1.0).warnings
+    assert notice.startswith("--place is 0.75 m above the ground")
+    (level,) = re.findall(r"--ground (\S+)", notice)
+    a, b, c, d = map(float, level.split(","))
+    placed = place_asset(LOW, HIGH, camera, (a, b, c, d), place=asked, scale=1.0)
+    np.testing.assert_allclose(world(placed.asset_to_world, (1.0, 0.5, 1.0))[0], asked, atol=1e-9)
+    near = place_asset(LOW, HIGH, camera, place=(0.5, 0.005, -20.0), scale=1.0)
+    assert not placed.warnings and not near.warnings
 
 
 def test_placement_tells_distance_size_and_pixels() -> None:

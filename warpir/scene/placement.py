@@ -18,6 +18,8 @@ from warpir.scene.receiver import ReceiverMesh, first_hit
 
 DEFAULT_STAND = (0.5, 0.75)
 """Default place of an object, as fractions of the photo's width and height."""
+OFF_GROUND = 0.01
+"""Distance from the ground by which a place may be moved without a word [m]."""
 MILLIMETRES = 500.0
 """Longest side from which an object around the camera is taken to be in millimetres [m]."""
 SMALLEST_PLAUSIBLE = 0.01
@@ -113,7 +115,7 @@ def place_asset(
     if place is not None:
         stand = np.asarray(place, dtype=np.float64)
         if is_plane:
-            stand = stand - plane[:3] * (plane[:3] @ stand + plane[3])
+            stand = _onto_ground(stand, plane, warnings)
     else:
         if at is None:
             at = (DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height)
@@ -295,6 +297,20 @@ def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
             f"outside the photo (found {at[0]:g},{at[1]:g}; "
             f"expected up to {camera.width},{camera.height})",
         )
+
+
+def _onto_ground(stand: Float64Array, plane: Float64Array, warnings: list[str]) -> Float64Array:
+    """Return a place moved onto the ground along its normal, and warn where that is far."""
+    rise = float(plane[:3] @ stand + plane[3])
+    if abs(rise) > OFF_GROUND:
+        side = "above" if rise > 0.0 else "below"
+        level = ",".join(f"{part:.6g}" for part in (*plane[:3], plane[3] - rise))
+        warnings.append(
+            f"--place is {abs(rise):.3g} m {side} the ground, onto which the object is moved; "
+            f"--ground {level} is a ground at its height"
+        )
+    moved: Float64Array = stand - plane[:3] * rise
+    return moved
 
 
 def _point_at_pixel(
