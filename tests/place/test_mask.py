@@ -118,9 +118,22 @@ def test_page_paints_and_saves_what_stands_in_front(
         save(opened)
         saved = json.loads((out / "insert.json").read_text())
         assert saved["occluder_mask"] == str(out / "occluder.png")
+        first = page.evaluate(STATE)
         mask = np.asarray(Image.open(out / "occluder.png"))
         assert mask.shape == (HEIGHT, WIDTH)
         assert mask[200, 120] == 255 and mask[200, 220] == 0 and mask[40, 200] == 0
+    # Another session goes on with it, and replaces it.
+    (out / "insert.json").write_text(json.dumps(saved | {"samples": 3}))
+    again = ["--config", str(out / "insert.json"), "--no-browser", "--out", str(out)]
+    with placing(again, width, 800, known="willReadFrequently") as opened:
+        page = opened.page
+        found = page.evaluate(STATE)
+        for name in ("camera", "stance", "stand", "size", "turn"):
+            assert found[name] == pytest.approx(first[name])
+        assert page.evaluate(alpha, [120.0, 200.0]) == 255
+        assert page.evaluate(alpha, [220.0, 200.0]) == 0
+        save(opened)
+        assert json.loads((out / "insert.json").read_text()) == saved | {"samples": 3}
         # A placement without a mask leaves none behind.
         page.click("#paint")
         page.click("#clear-mask")

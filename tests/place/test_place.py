@@ -185,6 +185,22 @@ def test_folder_replaces_its_own_only(inputs: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["camera.json", "insert.json"]
 
 
+def test_folder_goes_on_with_its_placement(inputs: Path, tmp_path: Path) -> None:
+    """What a session goes on with is its own until somebody else changes it; nothing else is."""
+    files = placed_files(inputs, tmp_path / "out")
+    path = PlacementFolder(str(tmp_path / "out"), overwrite=False).write(files)
+    other = PlacementFolder(str(tmp_path / "out"), overwrite=False)
+    other.take(str(tmp_path / "insert.json"))
+    with pytest.raises(InputError, match="exists already"):
+        other.check()
+    other.take(str(path))
+    path.write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        other.write(files)
+    other.take(str(path))
+    assert other.write(files) == path and path.read_text() != "mine"
+
+
 @pytest.mark.case("N19")
 @pytest.mark.parametrize(
     ("change", "words"),

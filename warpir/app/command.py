@@ -95,13 +95,22 @@ def parse(argv: Sequence[str]) -> Command:
     """
     texts = read_arguments(_make_parser(), argv)
     validate, path = texts.pop("validate", False), texts.pop("config", None)
-    filed: dict[str, Any] = {}
-    if path is not None:
-        filed = read_config_file(path, _limits_for_config(texts))
-        raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
+    values, notices = (texts, ()) if path is None else over_file(path, texts)
+    config = InsertConfig(**read_values(values))
+    config.require_inputs()
+    return Command(config, validate, notices)
+
+
+def over_file(path: str, texts: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return a configuration file's values with those of flags in their place, and notices.
+
+    Raises:
+        InputError: The file cannot be used (`ExitCode.USAGE`).
+    """
+    filed = read_config_file(path, _limits_for_config(texts))
+    raise_all([_not_by_hand(path, n) for n in BY_HAND if filed.get(n) and n not in texts])
     # Not a camera file, which says more than the one number that would take its place.
     excluded = replaced_by(texts, filed.keys() - {"camera"})
-    config = InsertConfig(**read_values(filed | excluded | texts))
     notices = tuple(
         f"{flag(name)} given at the command line replaces the value in {path}"
         for name in texts
@@ -116,8 +125,7 @@ def parse(argv: Sequence[str]) -> Command:
             what = f"{file}, named in {path}, is not in the folder where the command runs"
             notices += (f"{what}, at which relative paths start",)
             break
-    config.require_inputs()
-    return Command(config, validate, notices)
+    return {**filed, **excluded, **texts}, notices
 
 
 def _not_by_hand(path: str, name: str) -> InputError:

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from warpir.app.config import InsertConfig
+from warpir.app.config import InsertConfig, replaced_by
 from warpir.app.program import say
 from warpir.core.strict_json import parse_json_object
 from warpir.place.renderings import Renderings
 from warpir.place.session import (
+    CONFIG,
     PAGE,
     PlacementFolder,
     Session,
     asset_glb,
     kept_values,
+    mask_layer,
     photo_jpeg,
     placement_files,
     sent_camera,
@@ -28,10 +30,20 @@ from warpir.place.worker import Worker
 
 
 class Answers:
-    """One session's answers; placements are saved in ``folder``, the configuration has ``out``."""
+    """One session's answers; placements are saved in ``folder``, the configuration has ``out``.
 
-    def __init__(self, session: Session, folder: PlacementFolder, config: InsertConfig) -> None:
+    What is ``unseen`` by the page is saved beside what it sends.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        folder: PlacementFolder,
+        config: InsertConfig,
+        unseen: Mapping[str, Any],
+    ) -> None:
         self.session = session
+        self.unseen = unseen
         self.folder = folder
         self.asked = config.flat()
         self.worker = Worker()
@@ -42,6 +54,8 @@ class Answers:
             "photo.jpg": partial(photo_jpeg, session.photo),
             "asset.glb": partial(asset_glb, session.asset),
         }
+        if session.mask is not None:
+            self.contents["mask.png"] = partial(mask_layer, session.mask)
         """Files of the page that depend on the session, by address."""
         self.posts: dict[str, Callable[[bytes], dict[str, Any]]] = {
             "save": self.save,
@@ -66,7 +80,11 @@ class Answers:
 
     def save(self, body: bytes) -> dict[str, Any]:
         """Write the placement that the page sends; print and return the command that uses it."""
-        path = self.folder.write(self._files(body))
+        files = self._files(body)
+        placed = files[CONFIG]
+        assert isinstance(placed, dict)
+        kept = {n: v for n, v in self.unseen.items() if n not in replaced_by(placed, self.unseen)}
+        path = self.folder.write({**files, CONFIG: {**kept, **placed}})
         command = f"python -m warpir.insert --config {shlex.quote(str(path))}"
         say(f"saved: {path}")
         say(command)

@@ -4,8 +4,8 @@
 
 opens a page on this machine: the horizon, the ground and the object are dragged into place, and
 Save writes ``camera.json`` and ``insert.json`` into --out, which ``python -m warpir.insert --config
-placed/street/insert.json`` takes. torch is loaded here only for a camera that has to be estimated;
-the light is estimated in a process of its own.
+placed/street/insert.json`` takes; with the same --config this program goes on. torch is loaded here
+only for a camera that has to be estimated; the light is estimated in a process of its own.
 """
 
 import os
@@ -17,9 +17,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from warpir.app.command import flags_of, make_parser, read_arguments, read_values
-from warpir.app.config import DEMO_HINT, InsertConfig, flag, usage
+from warpir.app.command import flags_of, make_parser, over_file, read_arguments, read_values
+from warpir.app.config import DEFAULTS, DEMO_HINT, InsertConfig, flag, usage
 from warpir.app.program import run_program, say
 from warpir.core.errors import ExitCode, raise_all
 from warpir.core.signals import Stopped
@@ -33,7 +34,7 @@ FLAGS = {
     "where the page starts": flags_of(
         "camera", "frame", "fov", "pitch", "roll", "horizon", "camera_height", "camera_from", "up",
         "ground", "place", "at", "rotate_y", "scale", "size", "asset_up", "sun", "sky", "lamp",
-        "lamps",
+        "lamps", "occluder_mask",
     ),
     "rules for the files": flags_of(
         "alpha", "max_pixels", "strict", "max_file_bytes", "max_triangles", "max_texture_pixels",
@@ -51,13 +52,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     parser = make_parser("place", USAGE, DESCRIPTION, "", FLAGS)
     group = parser.add_argument_group("the page")
+    goes_on = "A saved insert.json to go on with; or a configuration or run.json of an insertion"
+    group.add_argument("--config", metavar="FILE", help=goes_on)
     group.add_argument("--port", metavar="N", help="Port of 127.0.0.1 (default: any that is free)")
     group.add_argument("--no-browser", action="store_true", help="Only print the address")
     group.add_argument("--once", action="store_true", help="End after the placement was saved")
     texts = read_arguments(parser, arguments)
     port = _port(texts.pop("port", "0"))
     opens, once = not texts.pop("no_browser", False), texts.pop("once", False)
-    config = _with_inputs(InsertConfig(**read_values(texts)))
+    path = texts.pop("config", None)
+    values, unseen = (read_values(texts), {}) if path is None else _from_file(path, texts)
+    config = _with_inputs(InsertConfig(**values))
 
     from warpir.io.lamps_file import given_lamps
     from warpir.place.answers import Answers
@@ -66,6 +71,8 @@ def _run(arguments: list[str]) -> int:
 
     assert config.output.out is not None
     folder = PlacementFolder(config.output.out, config.output.overwrite)
+    if path is not None:
+        folder.take(path)
     folder.check()
     near = config.light.lamp, config.light.lamps
     lamps = given_lamps(*near, config.limits, lambda line: say(f"notice: {line}"))
@@ -74,7 +81,7 @@ def _run(arguments: list[str]) -> int:
     for line in session.assumed:
         say(f"assumed: {line}")
     with ExitStack() as until_end:
-        answers = Answers(session, folder, config)
+        answers = Answers(session, folder, config, unseen)
         until_end.callback(answers.close)
         server = PlaceServer(port, answers.contents, answers.posts, answers.file, once=once)
         until_end.enter_context(server)
@@ -119,6 +126,31 @@ def way_to(address: str) -> Iterator[Path]:
         path.touch(mode=0o600)
         path.write_text(content, encoding="utf-8")
         yield path
+
+
+def _from_file(path: str, texts: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return values of a configuration under those of flags: the page's, and what it does not know.
+
+    A placement that was saved goes on in its folder.
+
+    Raises:
+        InputError: The file cannot be used (`ExitCode.USAGE`).
+    """
+    from warpir.place.session import CONFIG
+
+    merged, notices = over_file(path, texts)
+    if "out" not in texts:
+        merged.pop("out", None)
+        if os.path.basename(path) == CONFIG:
+            merged["out"] = os.path.dirname(os.path.abspath(path))
+    values = {n: v for n, v in read_values(merged).items() if v != DEFAULTS[n]}
+    unseen = {n: values.pop(n) for n in values.keys() - {n for f in FLAGS.values() for n in f}}
+    for line in notices:
+        say(f"notice: {line}")
+    if unseen:
+        named = ", ".join(sorted(unseen))
+        say(f"notice: the page does not show what {path} says of {named}; a save keeps it")
+    return values, unseen
 
 
 def _with_inputs(config: InsertConfig) -> InsertConfig:

@@ -11,7 +11,7 @@ import base64
 import io
 import os
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from warpir.app.photo_world import (
 )
 from warpir.app.settings import CameraConfig, InputConfig, LightConfig, PlacementConfig
 from warpir.calibration.photos import estimate_photo
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import replacing, write_staged
 from warpir.core.errors import ExitCode, InputError, disk_error
 from warpir.core.limits import Limits
@@ -39,7 +39,7 @@ from warpir.core.progress import Log
 from warpir.core.strict_json import json_bytes
 from warpir.io.cameras.source import focal_length, number
 from warpir.io.gltf.writer import write_glb
-from warpir.io.images.photos import Photo
+from warpir.io.images.photos import Photo, read_mask
 from warpir.io.lamps_file import LAMPS
 from warpir.lighting.scene_light import SKIES, SUN_TO_SKY
 from warpir.place.lamps import lamps_file, page_lamps
@@ -52,11 +52,15 @@ from warpir.scene.placement import place_asset, upright_plane
 
 CAMERA, CONFIG, MASK = "camera.json", "insert.json", "occluder.png"
 """Names of the files."""
+FILES = CAMERA, CONFIG, MASK, LAMPS
 MASK_SIDE = 2048
 """Longest side of the page's mask [px]."""
 PHOTO_SIDE = 2048
 """Longest side of the photo for the page [px]."""
-PLACED = ("place", "at", "rotate_y", "scale", "size", "sun", "sky", "lamp", "lamps")
+PLACED = (
+    *("place", "at", "rotate_y", "scale", "size", "sun", "sky", "lamp", "lamps"),
+    "occluder_mask",
+)
 """Fields that the page sets."""
 SEEN_BY = (
     *("camera", "frame", "up", "fov", "pitch", "roll", "horizon", "camera_height", "camera_from"),
@@ -87,6 +91,8 @@ class Session:
     """Initial turn about the vertical [deg]."""
     assumed: tuple[str, ...]
     """Assumed and doubtful values, one line each."""
+    mask: FloatArray | None = None
+    """Initial share of each pixel in which the photo stays in front, shape [H, W]."""
     lamps: tuple[Lamp, ...] = ()
     """Initial lamps near the object, in the world frame."""
 
@@ -127,7 +133,11 @@ def open_session(
         return world, placed.asset_to_world, [*placed.assumed, *placed.warnings]
 
     world, asset_to_world, lines = seen_by(camera)
-    assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices, *lines]
+    mask, about_mask = None, list[str]()
+    if inputs.occluder_mask is not None:
+        size = world.camera.width, world.camera.height
+        mask = read_mask(inputs.occluder_mask, size, max_pixels=limits.pixels, notices=about_mask)
+    assumed = [*log.assumed, *world.camera.assumed, *world.camera.notices, *lines, *about_mask]
     return Session(
         photo,
         name,
@@ -138,6 +148,7 @@ def open_session(
         asset_to_world,
         placement.rotate_y,
         tuple(assumed),
+        mask,
     )
 
 
@@ -207,6 +218,7 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
         "sun_to_sky": SUN_TO_SKY,
         "ground_albedo": light.assumed_albedo,
         "lamps": page_lamps(session.lamps, session.frame),
+        "has_mask": session.mask is not None,
         "assumed": list(session.assumed),
         "folder": folder,
     }
@@ -220,6 +232,17 @@ def photo_jpeg(photo: Photo) -> bytes:
     picture.thumbnail((PHOTO_SIDE, PHOTO_SIDE), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
     picture.save(stream, "JPEG", quality=90)
+    return stream.getvalue()
+
+
+def mask_layer(mask: FloatArray) -> bytes:
+    """Return a mask, shape [H, W], as the page paints it: a white PNG that it makes opaque."""
+    from PIL import Image
+
+    grey = Image.fromarray(np.round(mask * 255.0).astype(np.uint8))
+    grey.thumbnail((MASK_SIDE, MASK_SIDE), Image.Resampling.BILINEAR)
+    stream = io.BytesIO()
+    Image.merge("LA", (Image.new("L", grey.size, 255), grey)).save(stream, "PNG")
     return stream.getvalue()
 
 
@@ -356,6 +379,13 @@ class PlacementFolder:
         """Whether a placement of this session is in it."""
         return bool(self._written)
 
+    def take(self, config: str) -> None:
+        """Take what is there for this session's own, if that is the placement it goes on with."""
+        goes_on = os.path.abspath(config) == os.path.abspath(self.path / CONFIG)
+        for name in FILES if goes_on else ():
+            with suppress(FileNotFoundError):
+                self._written[name] = (self.path / name).read_bytes()
+
     def check(self) -> None:
         """Check that a placement can be saved.
 
@@ -365,7 +395,7 @@ class PlacementFolder:
         if self.path.exists() and not self.path.is_dir():
             what = "not a folder (found a file)"
             raise InputError(self.path, what, "choose another --out", ExitCode.OUTPUT)
-        for name in (CAMERA, CONFIG, MASK, LAMPS):
+        for name in FILES:
             path = self.path / name
             if self.overwrite or not os.path.lexists(path):
                 continue

@@ -10,9 +10,10 @@ export class Mask {
   #drawn = [];
   #isTinted = false;
 
-  // `elements` has front (the canvas over the object), toggle, options, brush, eraser, width, clear.
-  constructor(elements, photo, size, history, stage) {
-    Object.assign(this, elements, { photo, history, stage });
+  // `elements` has front (the canvas over the object), toggle, options, brush, eraser, width, clear;
+  // `saved` is an image of what was painted before, the first stroke of the state, or null.
+  constructor(elements, photo, saved, size, history, stage) {
+    Object.assign(this, elements, { photo, saved, history, stage });
     this.scale = Math.min(1, SIDE / Math.max(size.width, size.height));
     const [width, height] = [size.width, size.height].map((side) => Math.max(1, Math.round(side * this.scale)));
     this.canvas = Object.assign(document.createElement('canvas'), { width, height });
@@ -60,7 +61,12 @@ export class Mask {
     return isOn;
   }
 
-  #stroke(brush, { points, radius, isErased }) {
+  #stroke(brush, { points, radius, isErased, isSaved }) {
+    if (isSaved) {
+      brush.globalCompositeOperation = 'source-over';
+      brush.drawImage(this.saved, 0, 0, this.canvas.width, this.canvas.height);
+      return;
+    }
     const [first, ...others] = points.map((point) => point.map((part) => part * this.scale));
     Object.assign(brush, { lineWidth: 2 * radius * this.scale, lineCap: 'round', lineJoin: 'round' });
     brush.globalCompositeOperation = isErased ? 'destination-out' : 'source-over';
@@ -107,7 +113,7 @@ export class Mask {
   #grows(mask) {
     const last = this.#drawn.at(-1);
     const next = mask[this.#drawn.length - 1];
-    return !last || last === next || (last.isErased === next.isErased && last.radius === next.radius
+    return !last || last === next || (!last.isSaved && last.isErased === next.isErased && last.radius === next.radius
       && last.points.length <= next.points.length && last.points.every((point, k) => point === next.points[k]));
   }
 

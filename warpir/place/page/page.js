@@ -29,7 +29,7 @@ const lighting = new Lighting(start, await photoPixels($('photo')), {
   ask: (camera) => post('light', sentCamera(camera)),
 });
 const { camera, stance, stand, rotate_y: turn, size } = start;
-const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lamps: start.lamps, lines: null, ruler: null, mask: [], isUpright: looksUpright() }, {
+const history = new History({ camera, stance, stand, turn, size, light: lighting.opening(), lamps: start.lamps, lines: null, ruler: null, mask: start.has_mask ? [{ isSaved: true }] : [], isUpright: looksUpright() }, {
   show,
   begun: () => $('stage').classList.add('dragging'),
   moved: readOut,
@@ -40,6 +40,12 @@ const history = new History({ camera, stance, stand, turn, size, light: lighting
     $('redo').disabled = !canRedo;
   },
 });
+async function image(address) {
+  const loaded = Object.assign(new Image(), { src: address });
+  await loaded.decode();
+  return loaded;
+}
+
 // The stage, or why there is none: without it nothing here can be used.
 function drawn() {
   try {
@@ -73,7 +79,7 @@ const ruler = new Ruler($('handles'), $('stage'), history, {
 const mask = new Mask({
   front: $('front'), toggle: $('paint'), options: $('mask-options'), brush: $('brush'), eraser: $('eraser'),
   width: $('brush-width'), clear: $('clear-mask'),
-}, $('photo'), start.photo, history, $('stage'));
+}, $('photo'), start.has_mask ? await image('mask.png') : null, start.photo, history, $('stage'));
 const pictures = new Pictures({
   preview: $('preview'), insert: $('insert'), cancel: $('cancel'), picture: $('picture'), bar: $('bar'),
   words: $('rendering-words'), report: $('report'),
