@@ -22,7 +22,7 @@ from warpir.lighting.exposure import (
     expected_change,
 )
 from warpir.lighting.regression import Regression
-from warpir.scene.light import axis_from_angles
+from warpir.scene.light import Light, axis_from_angles
 from warpir.scene.shadow_mask import ShadowMask
 
 ELEVATION = 50.0
@@ -236,3 +236,28 @@ def test_a_glimpse_of_the_ground_is_not_enough() -> None:
     open_gap = ask_ground(regression(), replace(inputs, occluder=mask))
     assert open_gap is not None
     assert open_gap.implied == pytest.approx(0.3, rel=3e-3)
+
+
+def test_light_without_a_clear_direction_casts_a_soft_shadow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The object's glints stay sharp; so does all of a clear light, and what a mask is given of."""
+    monkeypatch.setattr(estimate, "load_regressor", lambda *_: None)
+    config = InsertConfig(photo="p", asset="a", out="o", tone="linear")
+
+    def estimated(spread_deg: float, inputs: Inputs) -> tuple[Light, Light]:
+        found = a_regression(spread_deg=spread_deg)
+        light = estimate_light(inputs, config.light, config.tone_operator, found).light
+        return light.light, light.light_shadow
+
+    inputs = inputs_of(0.3)
+    mask = ShadowMask(np.zeros(inputs.photo.srgb.shape[:2], np.float32), 0.0)
+    for spread_deg, given in ((30.0, inputs), (60.0, replace(inputs, shadow_mask=mask))):
+        light, shadow = estimated(spread_deg, given)
+        assert shadow is light
+    light, shadow = estimated(60.0, inputs)
+    assert light.lobes is not None and shadow.lobes is not None
+    assert light.lobes.sharpness[0] == pytest.approx(0.05**-2)
+    assert shadow.lobes.sharpness[0] == pytest.approx(math.radians(30.0) ** -2)
+    axis = light.lobes.axis[0].astype(np.float64)
+    np.testing.assert_allclose(shadow.irradiance(axis), light.irradiance(axis), rtol=1e-3)

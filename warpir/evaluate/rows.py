@@ -133,7 +133,8 @@ def regression(network: Regressor, place: Place) -> Prediction:
     about: dict[str, Any] = {"spread_deg": estimate.spread_deg, "sun_in_view": estimate.sun_in_view}
     if estimate.sun_in_view is None:
         about["truth_mass"] = _truth_mass(estimate, place)
-    return Prediction.of(Light(lobes=estimate.lobes()), **about)
+    prediction = Prediction.of(Light(lobes=estimate.lobes()), **about)
+    return replace(prediction, light_shadow=Light(lobes=estimate.shadow_lobes()))
 
 
 def _truth_mass(estimate: Regression, place: Place) -> float:

@@ -65,9 +65,11 @@ def estimate_light(
         stops = 0.0 if ground is None else ground.stops
         assumed.append(_describe_level(ground))
     gain = tone_gain(inputs, tone) * 2.0**stops
-    light = Light(lobes=regression.lobes()).scaled(gain)
+    shadow = light = Light(lobes=regression.lobes()).scaled(gain)
+    if not regression.is_clear and inputs.shadow_mask is None:  # a mask tells of a lamp
+        shadow = Light(lobes=regression.shadow_lobes()).scaled(gain)
     curves = Curves.identity(tone)
-    scene_light = SceneLight(light, light, curves, float(np.log2(gain)), tuple(assumed))
+    scene_light = SceneLight(light, shadow, curves, float(np.log2(gain)), tuple(assumed))
     return Estimate(regression, ground, gain, scene_light)
 
 
@@ -88,7 +90,8 @@ def _describe_direction(regression: Regression) -> str:
             "as suns in view are; all other light is what the regressor sees in the photo "
             "(--no-visible-sun, --sun, --light)"
         )
-    where = "mainly from" if regression.is_clear else "from no clear direction, perhaps mainly from"
+    unclear = "from no clear direction, so its shadow is soft, perhaps mainly from"
+    where = "mainly from" if regression.is_clear else unclear
     return (
         f"the light is what the regressor sees in the photo: {where} azimuth "
         f"{round(azimuth)}, elevation {round(elevation)}, +- {regression.spread_deg:.0f} degrees "

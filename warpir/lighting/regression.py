@@ -34,6 +34,9 @@ quite wrong."""
 CLEAR_DEG = 40.0
 """Expected angle to the truth up to which a direction of the light counts as seen [deg]: that of a
 network that sees nothing is 65, an even distribution over its directions."""
+SOFTENING = 0.5
+"""Least angular standard deviation of the dominant light that casts a shadow where it does not
+count as seen, over the expected angle to the truth [1]."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,14 @@ class Regression:
             np.concatenate([self.axis[None], self.ambient.axis]).astype(np.float32),
             np.append(sharpness, self.ambient.sharpness).astype(np.float32),
         )
+
+    def shadow_lobes(self) -> Lobes:
+        """Return the lobes that cast the shadow: soft where the dominant light is not seen.
+
+        A hard shadow in a wrong direction is further from the truth than a soft one, whereas the
+        object's glints stay as sharp as lamps are.
+        """
+        return self.lobes(0.0 if self.is_clear else SOFTENING * math.radians(self.spread_deg))
 
     def irradiance(self, normal: Float64Array) -> Float64Array:
         """Return the expected irradiance of a surface over all directions, linear RGB, shape [3].
