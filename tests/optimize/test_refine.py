@@ -705,14 +705,16 @@ def test_stopped_refinement_resumes(folder: Path, refined: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_emission_refinement_runs(folder: Path, tmp_path: Path) -> None:
-    """Under a light that is given; the run says that the ground does not see it."""
+@pytest.mark.parametrize("no_bounce", [None, ""])
+def test_emission_refinement_runs(folder: Path, tmp_path: Path, no_bounce: str | None) -> None:
+    """Under a light that is given; the run says who sees what falls on the ground."""
     out = tmp_path / "out"
-    light = {"reuse": None, "sky": "overcast", "refine_materials": "red"}
+    light = {"reuse": None, "sky": "overcast", "refine_materials": "red", "no_bounce": no_bounce}
     assert main(argv(folder, out, "emission", no_personalize="", loss="csd", **light)) == 0
     run = record_of(out)
     assert run["measured"]["refine"]["free"] == ["emission"]
-    assert refine_module.GROUND_IS_DARK in run["notices"]
+    told = refine_module.GROUND_IS_UNSEEN, refine_module.GROUND_IS_DARK
+    assert [line for line in run["notices"] if line in told] == [told[no_bounce is not None]]
     (entry,) = json.loads((out / "materials.json").read_text())["materials"]
     assert min(entry["emission"]) > 0.0
     assert {k: entry[k] for k in LOWEST} == {k: entry["before"][k] for k in LOWEST}

@@ -49,6 +49,7 @@ LOWEST = {"base_color": 0.0, "metallic": 0.0, "roughness": 0.05}
 EMISSION_START = 0.01
 """Least start of a material's emission, relative [W/(m^2 sr)]."""
 GROUND_IS_DARK = "what the object emits does not light the ground"
+GROUND_IS_UNSEEN = "guidance did not see what the object emits onto the ground; the picture does"
 
 
 # ------------------------------------------------------------------------------ unknowns
@@ -348,7 +349,8 @@ def refine(run: Run, light: SceneLight) -> Outcome:
         run.output.write_json(MATERIALS, materials_to_json(asset.materials, refined))
         asset = replace(asset, materials=refined)
         if run.config.task.refine == "emission":
-            notices = (*notices, GROUND_IS_DARK)
+            unseen = GROUND_IS_UNSEEN if run.config.render.bounce else GROUND_IS_DARK
+            notices = (*notices, unseen)
     inputs = replace(run.inputs, asset=asset)
     return Outcome(light, inputs, {**course.record("mis"), "refine": moves}, notices)
 
