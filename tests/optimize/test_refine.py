@@ -740,6 +740,7 @@ def test_tone_refinement_runs_on_an_altered_photo(folder: Path, tmp_path: Path) 
     [
         ("material", {"refine_materials": "red,doors"}, "no material 'doors' in"),
         ("tone", {"no_tone_curve": ""}, "--no-tone-curve"),
+        ("tone", {"accept": ""}, "--accept: needs --model without --refine"),
         ("tone", {"refine_parts": "metallic"}, "--refine-parts"),
         ("material", {"refine_parts": "sheen"}, "--refine-parts"),
         ("material", {"reuse": None}, "--refine: needs a known light"),

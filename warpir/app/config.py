@@ -373,7 +373,8 @@ def _needs_of_prior(config: InsertConfig) -> Needs:
     guided = config.is_guided
     yield "show_prior", guided, "--model"
     yield "resume", guided, "--model: nothing else has checkpoints"
-    yield "accept", guided, "--model, whose result it judges"
+    is_judged = guided and config.task.refine is None
+    yield "accept", is_judged, "--model without --refine: it judges a light that is recovered"
     is_recovering = guided and config.task.refine is None and config.light.has_lamps
     yield "recover_lamps", is_recovering, "--lamp or --lamps, and --model without --refine"
     yield "refine", guided, "--model, which judges the change"
