@@ -23,7 +23,7 @@ from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import DEFAULTS, EXCLUSIVE, OPTIONS, InsertConfig, flag
 from warpir.app.config_file import ELSEWHERE
-from warpir.app.inputs import read_inputs
+from warpir.app.inputs import _without_effect, read_inputs
 from warpir.app.program import say
 from warpir.app.record import PATHS, RUN_FORMAT
 from warpir.app.settings import RenderConfig
@@ -780,6 +780,34 @@ def test_flags_without_effect_are_said(
     assert warpir.insert.main([*scene, *unread, "--validate"]) == ExitCode.DONE
     (line,) = [s for s in capsys.readouterr().out.splitlines() if "without effect" in s]
     assert {*line.partition("guides: ")[2].split(", ")} == {s for s in unread if s[:2] == "--"}
+
+
+@pytest.mark.parametrize(
+    ("read", "why", "unread"),
+    [
+        ("--trust 2 --null-prompt x --lora-rank 2", "with --loss lds", "--negative-prompt x"),
+        ("", "where the light is estimated from the photo", "--lobes 8"),
+        ("--start uniform --lobes 8 --lobe-width 2", "with --start uniform", "--trust 2"),
+        ("--sun 30,40 --lobes 8", "where a light is given", "--lobe-width 2 --trust 2"),
+        ("--loss csd --base-prompt x", "where no LoRA is trained", "--indoors --lora-rank 2"),
+        ("--loss csd --show-prior x --lora-rank 2 --lora l", "with --loss csd", "--update-every 2"),
+        ("--lora l", "where no LoRA is trained", "--lora-steps 2"),
+        ("--loss dataset-update --update-every 2", "with --loss dataset-update", "--noises 2"),
+        ("--sky clear --refine tone --rate-tone 1", "with --refine tone", "--trust 2 --spread 1"),
+        ("--sky clear --refine material --mis-samples 2", "with --refine material", "--bend 1"),
+        ("--rate-tone 1", "without --refine", "--rate-material 1"),
+        ("--integrator mis --mis-samples 2", "with --integrator mis", "--retrace-at 2"),
+        ("--fusion single --chroma 1", "with --fusion single", "--fusion-start .1 --spread 1"),
+        ("--fusion none --spread 1", "with --fusion none", "--fusion-start .1"),
+    ],
+)
+def test_flags_that_guidance_does_not_read_are_said(read: str, why: str, unread: str) -> None:
+    """What loss, start, refinement or integrator leave unread is named, and nothing else is."""
+    config = parse([*NEEDED, *PAINTER, *read.split(), *unread.split()]).config
+    flags = {text for text in unread.split() if text.startswith("--")}
+    (line,) = _without_effect(config)
+    assert line.startswith(f"without effect {why}: ")
+    assert {*line.partition(": ")[2].split(", ")} == flags
 
 
 @pytest.mark.parametrize("axis", [None, "+z", "-z"])

@@ -189,10 +189,16 @@ LEAST_RADIUS = 1e-4
 """Of a lamp [m], as in its file (`warpir.scene.near.lamps`), which needs NumPy."""
 LOSSES_OF_BASE = ("csd", "sds-base", "good-bad", "sds-good-bad", "dataset-update")
 """Losses that do without an adapter."""
+LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
+"""Losses that use the base model alone."""
 LOSSES_AWAY = ("lds-negative", "good-bad", "sds-good-bad")
 """Losses that move away from a negative prompt."""
 LIGHTS = ("light", "sun", "sky", "reuse")
 """Fields that name a light."""
+OF_LIGHT = """lobes lobe_width light_height object_light_height fusion fusion_start fusion_end
+lobe_shape integrator transport_memory retrace_at rate_intensity rate_axis rate_width rate_chroma
+consistency spread chroma trust chroma_limit intensity_limit tone_bins"""
+"""Fields that the recovery of a light alone reads."""
 
 
 Check = Callable[[str, bool, str], Iterator[InputError]]
@@ -432,3 +438,58 @@ def refused_refinement(config: InsertConfig, asset: "Asset") -> Iterator[InputEr
                 advice = "name other materials by --refine-materials, or --refine-parts roughness"
                 yield usage("--refine", what, advice)
                 return
+
+
+READ_ANYWAY = ("guidance", "model", "preview_every", "guidance_width")
+"""Fields of a model's parts that say something without one: two are those of the preview."""
+
+
+def fields_of(part: str) -> list[str]:
+    """Return the fields of a part that only a model reads."""
+    named = [name for name, o in OPTIONS.items() if o.part == part and not o.rule.by_hand]
+    return [name for name in named if name not in READ_ANYWAY]
+
+
+def unread_by_loss(config: InsertConfig) -> Iterator[tuple[str, str]]:
+    """Yield a reason, and the fields of what a model is asked that nothing reads for it."""
+    loss, adapter = config.guidance.loss, config.adapter
+    is_away, is_edit = loss in LOSSES_AWAY, loss == "dataset-update"
+    is_shown, without_lora = bool(config.guidance.show_prior), loss in LOSSES_WITHOUT_LORA
+    is_read = {
+        "negative_prompt": is_away,
+        "guidance_scale": loss in ("sds", "sds-base"),
+        "null_prompt": not (is_away or is_edit),
+        "base_prompt": without_lora or (loss == "sds-good-bad" and not adapter.personalize),
+        "update_every update_steps update_scale": is_edit,
+        "noises weight literal_alpha time_min": not is_edit,
+        "lora": is_shown or not without_lora,
+    }
+    yield f"with --loss {loss}", " ".join(names for names, read in is_read.items() if not read)
+    is_trained = is_shown or (adapter.lora is None and not without_lora)
+    if not (adapter.personalize and is_trained):
+        of_training = {*fields_of("adapter")} - {"personalize", "token", "lora"}
+        yield "where no LoRA is trained", " ".join(sorted(of_training))
+
+
+def unread_by_loop(config: InsertConfig) -> Iterator[tuple[str, str]]:
+    """As `unread_by_loss`, of how a light is recovered or an object refined."""
+    refine, optimize = config.task.refine, config.optimize
+    rates = {"material": "rate_material", "emission": "rate_emission"}
+    others = " ".join(rate for what, rate in rates.items() if what != refine)
+    if refine is not None:
+        others += " mis_samples" if refine == "tone" else " tone_curve rate_tone bend"
+        yield f"with --refine {refine}", f"{OF_LIGHT} {others}"
+        return
+    yield "without --refine", others
+    names = "transport_memory object_light_height retrace_at"
+    names = names if optimize.integrator == "mis" else "mis_samples"
+    yield f"with --integrator {optimize.integrator}", names
+    if optimize.fusion != "schedule":
+        terms = " consistency spread" if optimize.fusion == "single" else ""
+        yield f"with --fusion {optimize.fusion}", f"fusion_start fusion_end{terms}"
+    if config.light.is_described:
+        yield "where a light is given", "lobe_width trust"
+    elif config.light.start == "uniform":
+        yield "with --start uniform", "trust"
+    else:
+        yield "where the light is estimated from the photo", "lobes lobe_width"

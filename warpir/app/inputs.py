@@ -9,7 +9,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from warpir.app.config import OPTIONS, InsertConfig, flag, refused_refinement, usage
+from warpir.app.config import (
+    DEFAULTS,
+    InsertConfig,
+    fields_of,
+    flag,
+    refused_refinement,
+    unread_by_loop,
+    unread_by_loss,
+    usage,
+)
 from warpir.app.model_files import require_model
 from warpir.app.photo_world import (
     CameraEstimator,
@@ -350,22 +359,18 @@ def _notices(
         yield "guidance does not see --occluder-mask; the pictures it leads to do"
 
 
-READ_ANYWAY = ("guidance", "model", "preview_every", "guidance_width")
-"""Fields of a model's parts that say something without one: two are those of the preview."""
-
-
 def _without_effect(config: InsertConfig) -> Iterator[str]:
-    """Yield the flags that were given and that nothing reads in this run."""
+    """Yield the flags that were given and that nothing reads in this run, a line a reason."""
+    unread = [*unread_by_loss(config), *unread_by_loop(config)]
+    if not config.is_guided:
+        parts = ("guidance", "diffusion", "adapter", "optimize")
+        of_a_model = [name for part in parts for name in fields_of(part)]
+        unread = [("where no model guides", " ".join(of_a_model))]
     values = config.flat()
-    of_a_model = [
-        flag(name)
-        for name, option in OPTIONS.items()
-        if option.part in ("guidance", "diffusion", "adapter", "optimize")
-        and not (option.rule.by_hand or name in READ_ANYWAY)
-        and values[name] != option.default
-    ]
-    if of_a_model and not config.is_guided:
-        yield f"without effect where no model guides: {', '.join(of_a_model)}"
+    for why, names in unread:
+        given = [flag(name) for name in names.split() if values[name] != DEFAULTS[name]]
+        if given:
+            yield f"without effect {why}: {', '.join(given)}"
     if config.light.reuse is not None and config.light.ground_albedo is not None:
         yield "--ground-albedo: without effect on the light of --reuse (--exposure)"
 

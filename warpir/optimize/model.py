@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpir.app.config import LOSSES_WITHOUT_LORA
 from warpir.app.run import Run
 from warpir.core import signals
 from warpir.core.atomic import Checkpoint, Checkpoints
@@ -33,8 +34,6 @@ from warpir.render.determinism import use_threads_for
 
 SHOWN_SEEDS = (0, 1, 2)
 """Seeds of the images of --show-prior."""
-LOSSES_WITHOUT_LORA = ("csd", "sds-base", "good-bad")
-"""Losses that use the base model alone."""
 
 
 @dataclass(frozen=True)
