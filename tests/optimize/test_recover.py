@@ -4,7 +4,7 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,10 +19,13 @@ from warpir.app.config import InsertConfig
 from warpir.app.finished import OtherRun, is_done
 from warpir.core.errors import ExitCode
 from warpir.core.limits import Limits
+from warpir.diffusion.prompts import make_prompts
+from warpir.diffusion.settings import PersonalizeSettings
 from warpir.insert import main
 from warpir.io.lamps_file import read_lamps
 from warpir.lighting.scene_light import SceneLight
 from warpir.lighting.sg_light import narrowest
+from warpir.optimize.model import assumed_class
 from warpir.scene.light import Light, sun_lobe
 from warpir.scene.tone_curves import Curves
 
@@ -105,11 +108,26 @@ def test_guided_run_writes_every_file_and_says_who_spoke(finished: Path) -> None
     assert {"model", "personalize", "trace", "optimize", "render"} <= set(run["seconds"])
     assert any("fp32" in notice for notice in run["notices"])
     assert any("even one" in line for line in run["assumed"])
+    assert any('show "box"' in line for line in run["assumed"])
     by_step = json.loads((finished / "optimization.json").read_text())["by_step"]
     assert len(by_step["gradient"]) == 8 and all(v > 0.0 for v in by_step["gradient"])
     assert sum(v is not None for v in by_step["score"]) == 4
     curves = json.loads((finished / "curves.json").read_text())
     assert curves["tone"] == "reinhard"
+
+
+def test_class_that_is_taken_from_the_prompt_is_said() -> None:
+    """A vase of flowers is taken for flowers; one word, one that is stated or none is no guess."""
+
+    def assumed(prompt: str, **given: Any) -> list[str]:
+        asked = PersonalizeSettings(**given)
+        return list(assumed_class(make_prompts(prompt, asked), asked))
+
+    (line,) = assumed("a vase of flowers")
+    assert '"flowers"' in line and "--class-noun" in line
+    assert not assumed("a car.") and not assumed("vase") and not assumed("An SUV")
+    for given in ({"class_noun": "vase"}, {"class_images": 0}, {"lora": "l.safetensors"}):
+        assert not assumed("a vase of flowers", **given)
 
 
 def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ from warpir.diffusion.personalization.personalize import (
 )
 from warpir.diffusion.personalization.show_prior import show_personalization
 from warpir.diffusion.prompts import Prompts, make_prompts
+from warpir.diffusion.settings import PersonalizeSettings
 from warpir.optimize.checkpoint import is_due
 from warpir.optimize.view import Frame
 from warpir.render.determinism import use_threads_for
@@ -164,11 +166,23 @@ def adapted(
     if config.adapter.personalize and does_without:
         notices = (f"--loss {loss} does without a LoRA: none was trained",)
     elif config.adapter.personalize:
+        run.log.assume(*assumed_class(prompts, config.adapter))
         with run.timings.stage("personalize"):
             learnt = personalized(run, prior, prompts, checkpoints, resumed)
         notices = learnt.notices
     prior.free_text_encoder()
     return Guided(prior, prompts, learnt, notices, checkpoints, resumed)
+
+
+def assumed_class(prompts: Prompts, asked: PersonalizeSettings) -> Iterator[str]:
+    """Yield what is painted as the object's class, where it is the last of the prompt's words.
+
+    That of "a vase of flowers" is another thing than the object.
+    """
+    is_painted = asked.lora is None and asked.class_images != 0
+    is_whole = prompts.guidance.startswith(f"{prompts.class_} in ")
+    if is_painted and asked.class_noun is None and not is_whole:
+        yield f'the class images show "{prompts.noun}", the prompt\'s last word (--class-noun)'
 
 
 def personalized(
