@@ -334,6 +334,8 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         ([*PAINTER, "--loss", "lds-negative"], "--loss", "--negative-prompt"),
         ([*PAINTER, "--loss", "sds-good-bad"], "--loss", "--negative-prompt"),
         ([*PAINTER, "--time-min", "0.7"], "--time-min", "at most --time-max (found 0.7 and 0.6)"),
+        ([*PAINTER, "--time-min", "0.4"], "--time-min", "at most --time-max-end (found 0.4 and"),
+        ([*PAINTER, "--time-max", "0.2"], "--time-max-end", "at most --time-max (found 0.3 and"),
         (["--crop-min", "5"], "--crop-min", "at most --crop-max (found 5 and 3)"),
         ([*PAINTER, "--accept", "--loss", "dataset-update"], "--accept", "--loss dataset-update"),
         (["--accept"], "--accept", "needs --model"),

@@ -402,7 +402,8 @@ def _losses_that_clash(config: InsertConfig) -> Iterator[InputError]:
         yield usage("--loss", f"{loss} needs --negative-prompt, which it moves away from")
     if asked.accept and loss == "dataset-update":
         yield usage("--accept", "cannot be used with --loss dataset-update, which has no potential")
-    for low, high in (("time_min", "time_max"), ("crop_min", "crop_max")):
+    ends = ("time_min", "time_max_end"), ("time_max_end", "time_max")
+    for low, high in (("time_min", "time_max"), *ends, ("crop_min", "crop_max")):
         least, greatest = getattr(asked, low), getattr(asked, high)
         if least > greatest:
             yield usage(flag(low), f"at most {flag(high)} (found {least:g} and {greatest:g})")
