@@ -22,9 +22,11 @@ from warpir.core.limits import Limits
 from warpir.diffusion.prompts import make_prompts
 from warpir.diffusion.settings import PersonalizeSettings
 from warpir.insert import main
+from warpir.io.images.photos import Photo
 from warpir.io.lamps_file import read_lamps
 from warpir.lighting.scene_light import SceneLight
 from warpir.lighting.sg_light import narrowest
+from warpir.optimize.course import unseen_plate
 from warpir.optimize.model import assumed_class
 from warpir.scene.light import Light, sun_lobe
 from warpir.scene.tone_curves import Curves
@@ -128,6 +130,17 @@ def test_class_that_is_taken_from_the_prompt_is_said() -> None:
     assert not assumed("a car.") and not assumed("vase") and not assumed("An SUV")
     for given in ({"class_noun": "vase"}, {"class_images": 0}, {"lora": "l.safetensors"}):
         assert not assumed("a vase of flowers", **given)
+
+
+@pytest.mark.parametrize(("unit", "words"), [(1e-3, "too dark"), (1e3, "too bright"), (1, "")])
+def test_plate_that_the_model_cannot_see_is_said(unit: float, words: str) -> None:
+    """In its own unit, clipped at 1, it may be black or white; a photograph never is."""
+    srgb = np.random.default_rng(0).uniform(0.0, 1.0, (8, 12, 3)).astype(np.float32)
+    plate = np.float32(unit) * srgb**2.2
+    lines = list(unseen_plate(Photo(plate, np.clip(plate ** (1 / 2.2), 0.0, 1.0), "exr")))
+    assert [words in line for line in lines] == [True] * bool(words)
+    dark = np.full((8, 12, 3), 2, np.uint8)
+    assert not list(unseen_plate(Photo(dark, dark / np.float32(255.0), "png")))
 
 
 def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(

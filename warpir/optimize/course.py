@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from warpir.core.errors import ExitCode, InputError
 from warpir.diffusion.dataset_update import DatasetUpdate
 from warpir.diffusion.guidance import Guidance
 from warpir.diffusion.personalization.lora_files import save_lora
+from warpir.io.images.photos import Photo
 from warpir.io.images.resize import resize
 from warpir.io.unfinished import remove_unfinished
 from warpir.lighting.scene_light import SceneLight
@@ -34,6 +36,8 @@ from warpir.scene.tone_curves import Curves
 
 SAY_EVERY = 25
 """Steps between two progress lines that describe the unknowns."""
+STOPS_MAX = 3.0
+"""How far the exposure of a plate may be from a photograph's before it is said [EV]."""
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the first preview, which is written before the slow stages."""
 NOT_IDENTITY = frozenset(
@@ -157,6 +161,17 @@ def open_checkpoints(run: Run) -> Checkpoints:
     return checkpoints
 
 
+def unseen_plate(photo: Photo) -> Iterator[str]:
+    """Yield how dark or bright a linear plate is for the model, which sees its values up to 1."""
+    stops = math.log2(photo.exposure)
+    if abs(stops) > STOPS_MAX:
+        yield (
+            "the model sees the plate's own values, clipped at 1, which are "
+            f"{abs(stops):.0f} stops too {'dark' if stops > 0.0 else 'bright'} for it: give the "
+            f"plate times {photo.exposure:.2g}"
+        )
+
+
 def make_frame(run: Run) -> Frame:
     """Return scene and photo at the loop's resolution.
 
@@ -164,6 +179,7 @@ def make_frame(run: Run) -> Frame:
         InputError: The object covers no pixel; checked before the model is adapted.
     """
     config, camera = run.config, run.inputs.camera
+    run.log.notice(*unseen_plate(run.inputs.photo))
     width = min(config.optimize.guidance_width, camera.width)
     small = camera.scaled(width, max(1, round(width * camera.height / camera.width)))
     curves = Curves.identity(config.tone_operator)
