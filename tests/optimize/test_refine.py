@@ -214,6 +214,17 @@ def test_curves_start_at_given_knots(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("bins", [1, 2, 64])
+def test_curves_of_any_bins_go_from_0_to_1(bins: int) -> None:
+    """A single bin has two knots as well: with fewer the kernels read beyond the array."""
+    knots = ToneCurve(3, bins).plain()
+    even = np.tile(np.linspace(0.0, 1.0, bins + 1), (3, 1))
+    for part in (knots.x, knots.y):
+        assert part.shape == even.shape
+        np.testing.assert_allclose(part, even, atol=1e-6)
+    assert knots.slope.shape == (3, bins + 1)
+
+
 def test_start_is_the_unrefined_image() -> None:
     """Free factors at their start give the asset's own picture, to the last bit."""
     own = (

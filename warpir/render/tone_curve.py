@@ -37,7 +37,7 @@ def _edges(raw: Tensor) -> Tensor:
     bins = raw.shape[1]
     size = MIN_BIN + (1.0 - MIN_BIN * bins) * torch.softmax(raw, dim=1)
     inner = torch.cumsum(size, dim=1)[:, :-1]
-    zero = torch.zeros_like(inner[:, :1])
+    zero = torch.zeros_like(raw[:, :1])
     return torch.cat([zero, inner, zero + 1.0], dim=1)
 
 
