@@ -142,9 +142,8 @@ def build(
         to_plane = mi.ScalarTransform4f().look_at(
             origin=normal * offset, target=normal * (offset + 1.0), up=np.roll(normal, 1)
         )
-        # Not a rectangle: that is two triangles, whose corners round where they slope.
         parts["ground"] = {
-            "type": "disk",
+            "type": "disk",  # a rectangle is two triangles, whose corners round where they slope
             "to_world": to_plane @ mi.ScalarTransform4f().scale([horizon, horizon, 1.0]),
             "bsdf": _matt(albedo) if coat is None else _coat(coat),
         }
