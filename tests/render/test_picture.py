@@ -26,6 +26,7 @@ from warpir.render.device_scene import Scene
 from warpir.render.integrator import Radiance
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.quality import Quality
+from warpir.render.picture.resizing import resize_planes
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.picture import picture_ratio
 from warpir.render.tone_curve import Knots, ToneCurve
@@ -342,6 +343,29 @@ def test_resized_geometry_is_not_mixed_with_the_background(
     assert other.albedo[seen].max(axis=1).min() > 0.75
     local = (other.position[seen] - VIEW.c2w[:3, 3]) @ VIEW.c2w[:3, :3]
     np.testing.assert_allclose(other.depth[seen], -local[:, 2], rtol=1e-3)
+
+
+@pytest.mark.parametrize("edge", [16.0, 15.5])
+@pytest.mark.parametrize("width", [16, 24, 96, 192])
+def test_no_light_leaks_in_where_a_resized_object_touches_its_shadow(
+    width: int, edge: float
+) -> None:
+    """Below the object's edge the shadow and the mirror image are those beside it."""
+    column = np.arange(48) * np.ones((32, 1))
+    planes = {name: np.zeros((32, 48, 3), np.float32) for name in ("position", "normal", "albedo")}
+    planes["matte"] = np.clip(edge - column, 0.0, 1.0).astype(np.float32)
+    planes["depth"] = np.where(column < edge, 1.0, np.inf).astype(np.float32)
+    planes["roughness"] = np.zeros((32, 48), np.float32)
+    shade, image = np.array([[0.3, 0.4, 0.5], [0.1, 0.2, 3.0]], np.float32)
+    shown = ((column >= edge - 0.9) & (column < 32))[..., None]
+    planes["shadow_ratio"] = np.where(shown, shade, 1.0).astype(np.float32)
+    planes["image"] = np.where(shown, image, 0.0).astype(np.float32)
+    resized = resize_planes(planes, width * 2 // 3, width)
+    contact = (resized["matte"] > 0.0) & (resized["matte"] < 0.99)
+    assert contact.any(axis=1).all()
+    np.testing.assert_allclose(resized["shadow_ratio"][contact] - shade, 0.0, atol=1e-5)
+    np.testing.assert_allclose(resized["image"][contact] - image, 0.0, atol=1e-5)
+    assert (resized["shadow_ratio"][:, -width // 8 :] == 1.0).all()
 
 
 def test_resize_keeps_coverage_and_constants() -> None:

@@ -7,17 +7,33 @@ from warpir.io.images.resize import resize
 
 SLIVER = 1e-4
 """Share of a pixel below which its surface layers are left empty [1]."""
+GROUND = {"shadow_ratio": 1.0, "image": 0.0, "hidden": 0.0, "kept": 0.0}
+"""Planes of the ground that is seen, and what they hold where the object hides all of it."""
+LEAST_GROUND = 1e-3
+"""Share of ground in a pixel below which these planes go back to that [1]."""
 
 
 def resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dict[str, FloatArray]:
     """Bring all planes to the photo's size.
 
     What describes the object's surface is averaged over the object alone: mixed with the empty
-    background, its depth would fall to 0 along the outline.
+    background, its depth would fall to 0 along the outline. What describes the ground is averaged
+    over the ground that is seen: no light leaks into the shadow at the object's contact.
     """
+    ground = 1.0 - planes["matte"]
+    ground_share = np.maximum(resize(ground, height, width), LEAST_GROUND)[..., None]
     seen = np.isfinite(planes["depth"])
     share = resize(seen.astype(np.float32), height, width)
-    resized = {name: resize(plane, height, width) for name, plane in planes.items()}
+    resized = {}
+    for name, plane in planes.items():
+        if name in GROUND:
+            # In differences, so that ground beyond shadow and image stays as it is.
+            change = resize((plane - GROUND[name]) * ground[..., None], height, width)
+            change /= ground_share
+            change += GROUND[name]
+            resized[name] = change
+        else:
+            resized[name] = resize(plane, height, width)
     shown = (share > SLIVER) & (resized["matte"] > 0.0)
     weight = np.where(shown, share, 1.0)
     for name in ("depth", "position", "normal", "albedo", "roughness"):
