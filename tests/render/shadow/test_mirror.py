@@ -165,3 +165,15 @@ def test_image_replaces_what_the_photo_mirrored(tone: str) -> None:
     np.testing.assert_allclose(shown[0, 1], expected - 0.2, rtol=1e-5)
     np.testing.assert_allclose(shown[0, 3], bright - 0.2, rtol=1e-5)
     np.testing.assert_allclose(shown[0, 4], beside - 0.2, rtol=1e-5)
+
+
+def test_image_on_a_linear_plate_does_not_end_at_white() -> None:
+    """Bright ground gains what the image adds, and an image may be brighter than 1."""
+    plate = np.array([[[3.0] * 3, [0.5] * 3]], np.float32)
+    planes = {name: np.zeros_like(plate) for name in ("hidden", "kept")}
+    planes["image"] = np.array([[[0.5] * 3, [9.0] * 3]], np.float32)
+    planes["shadow_ratio"] = np.ones_like(plate)
+    planes["matte"] = np.zeros((1, 2), np.float32)
+    curves = replace(Curves.identity("linear"), is_clipped=False)
+    added, _ = shown_mirror(planes, plate, curves, UNCHANGED)
+    np.testing.assert_allclose(added, planes["image"], rtol=1e-5)

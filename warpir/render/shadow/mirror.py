@@ -153,9 +153,9 @@ def shown_mirror(
     factor = np.minimum(1.0, (1.0 - KEPT) / np.maximum(share, TINY))
     ground = shown(before - factor * (hidden + kept)) * ratio
     without = shown(radiance(photo * ratio))
-    # As the object, the image is shown up to white.
-    light = radiance(ground) + factor * kept + image
-    mirrored = np.minimum(shown(light), np.maximum(without, 1.0))
+    mirrored = shown(radiance(ground) + factor * kept + image)
+    if curves.is_clipped:  # as the object, the image is shown up to white
+        mirrored = np.minimum(mirrored, np.maximum(without, 1.0))
     out = np.zeros_like(plate)
     out[changed] = (mirrored - without) * (1.0 - planes["matte"][changed, None])
     return out, int((hidden > (1.0 - KEPT) * before).any(axis=-1).sum())
