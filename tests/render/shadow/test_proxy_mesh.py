@@ -520,13 +520,14 @@ def test_run_with_place_and_mask(files: Path, tmp_path: Path) -> None:
 
 
 def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
-    """A wall and a white mask keep the sun from object and ground; masks mix linearly."""
+    """A wall and a white mask keep the sun from object and ground; a grey one a share of it."""
 
-    def ratio_and_object(**flags: str | None) -> tuple[FloatArray, float]:
+    def ratio_and_object(sun: float = 1.0, **flags: str | None) -> tuple[FloatArray, float]:
         inputs = read_inputs(config_of(files, **flags))
         # Of 16 bits: the layers of an 8-bit photo are halves.
         photo = replace(inputs.photo, codes=inputs.photo.codes.astype(np.uint16))
         light = Light(SUN, plain_sky((0.45, 0.62, 1.0), (0.2, 0.2, 0.2)))
+        light = without_lamps(light, 1.0 - sun)
         picture = make_picture(
             Renderer(scene_of(inputs, inputs.camera, device, LINEAR)), light, light, photo,
             Quality(16, 1, 2, 3), LINEAR, shadow_mask=inputs.shadow_mask,
@@ -540,12 +541,13 @@ def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
     assert same == lit
     white, dim = ratio_and_object(shadow_mask=str(files / "white.png"))
     half, _ = ratio_and_object(shadow_mask=str(files / "half.png"))
-    np.testing.assert_allclose(half, plain + (128 / 255) * (white - plain), atol=1e-5)
+    dimmed, _ = ratio_and_object(sun=127 / 255)
     walled, dark = ratio_and_object(proxy=str(files / "wall.glb"))
     # Of the ground that the sun reaches in the open, not of the object's sides.
     deep = plain[..., 0] < 0.5
     deep[:18] = False
     assert deep.sum() > 10
+    np.testing.assert_allclose(half[deep].mean(axis=0), dimmed[deep].mean(axis=0), atol=0.012)
     for ratio, light in ((white, dim), (walled, dark)):
         assert ratio[deep].mean() > plain[deep].mean() + 0.3 and light < 0.95 * lit
 

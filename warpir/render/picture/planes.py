@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpir.core.arrays import BoolArray, FloatArray, IntArray
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
@@ -22,6 +22,8 @@ from warpir.scene.lamps import without_lamps
 from warpir.scene.light import Light
 from warpir.scene.shadow_mask import ShadowMask
 from warpir.scene.tone_curves import Curves
+
+TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -139,21 +141,29 @@ def _shadow(
     resized = resize(shadow_mask.shares, camera.height, camera.width)
     shares = np.clip(resized, 0.0, 1.0).reshape(-1)
     lit = shaded(args, shares < 1.0)
-    rest = shaded(light_args(without_lamps(light), renderer.device), shares > 0.0)
-    return _mixed(lit, rest, shares)
+    left = without_lamps(light)
+    rest = shaded(light_args(left, renderer.device), shares > 0.0)
+    open_lit, open_rest = (x.irradiance(renderer.scene.receiver.normal) for x in (light, left))
+    return _mixed(lit, rest, shares, open_rest / np.maximum(open_lit, TINY))
 
 
 def _mixed(
     lit: tuple[IntArray, FloatArray],
     rest: tuple[IntArray, FloatArray],
     shares: FloatArray,
+    kept: Float64Array,
 ) -> tuple[IntArray, FloatArray]:
-    """Blend the ratio under the whole light and that without lamps by the mask.
+    """Return the ratio under the light less the mask's share of its lamps.
+
+    With s that share and k what open ground keeps of its light without them, the ratio is
+    ``((1 - s) lit + s k rest) / (1 - s + s k)``: each counts as much as the light that it is of.
 
     Args:
         lit: Pixels and ratio of the whole light; all others are 1.
         rest: The same without lamps.
-        shares: Weight of the second in each pixel [1].
+        shares: Share of the lamps that is taken away in each pixel [1].
+        kept: Share of the open plane's irradiance by the light from afar that is left without its
+            lamps [1], shape [3].
 
     Returns:
         Pixels of either, and their ratio.
@@ -162,8 +172,10 @@ def _mixed(
     whole, without = (np.ones((len(shares), 3), np.float32) for _ in range(2))
     whole[lit[0]], without[rest[0]] = lit[1], rest[1]
     whole, without, share = whole[pixels], without[pixels], shares[pixels, None]
+    weight = share * kept.astype(np.float32)
+    share = weight / np.maximum(1.0 - share + weight, TINY)
     # Exact where both agree, and at both ends.
-    return pixels, np.where(share < 1.0, whole + share * (without - whole), without)
+    return pixels, np.where(shares[pixels, None] < 1.0, whole + share * (without - whole), without)
 
 
 def _planes(
