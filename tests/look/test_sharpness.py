@@ -102,13 +102,14 @@ def test_no_edges_tell_nothing(value: float) -> None:
 
 
 def test_layers_are_blurred_alike() -> None:
-    """The outline keeps its colour, the contact its shadow, and far ground stays exactly 1."""
+    """The outline keeps its colour, the contact shadow and mirror image; far ground stays as is."""
     matte = np.zeros((60, 60), np.float32)
     matte[20:40, 20:40] = 1.0
     colour = np.array([0.6, 0.3, 0.1], np.float32)
     ratio = np.ones((60, 60, 3), np.float32)
     ratio[36:44, 16:44] = 0.2
     planes = {"matte": matte, "foreground": matte[..., None] * colour, "shadow_ratio": ratio}
+    planes["image"] = np.where((ratio < 1.0) & (matte[..., None] == 0.0), colour, np.float32(0.0))
     blurred = blurred_layers(planes, 1.2, ("foreground",))
     soft = blurred["matte"]
     assert soft.sum() == pytest.approx(matte.sum(), rel=1e-4)
@@ -116,6 +117,9 @@ def test_layers_are_blurred_alike() -> None:
     # Beside the object's foot the shadow is as dark as before: nothing leaks from under it.
     assert blurred["shadow_ratio"][41, 30].max() < 0.25
     assert (blurred["shadow_ratio"][:10] == 1.0).all()
+    np.testing.assert_allclose(blurred["image"][39, 30], colour, rtol=0.02)
+    assert 0.4 * colour[0] < blurred["image"][43, 30, 0] < 0.7 * colour[0]
+    assert not blurred["image"][:10].any()
     assert blurred_layers(planes, 0.0, ("foreground",)) is planes
 
 

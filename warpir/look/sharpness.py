@@ -41,6 +41,8 @@ that [px], and by which factor it must be the larger one [1]: what the widest de
 reads too low, a blur of 6 px as 1.6."""
 PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of a square pixel, the blur that a rendered edge has already [px]."""
+GROUND = {"shadow_ratio": 1.0, "image": 0.0, "hidden": 0.0, "kept": 0.0}
+"""Planes of the ground that is seen, and what they hold where the object hides all of it."""
 TRUNCATE = 3.5
 """Standard deviations at which a Gaussian that blurs a picture is cut."""
 
@@ -207,14 +209,14 @@ def shown_box(planes: dict[str, FloatArray], sigma: float) -> tuple[slice, slice
 def blurred_layers(
     planes: dict[str, FloatArray], sigma: float, summed: tuple[str, ...]
 ) -> dict[str, FloatArray]:
-    """Blur the object, its matte and its shadow by the lens.
+    """Blur the object, its matte, its shadow and its mirror image by the lens.
 
-    Premultiplied colours and the matte are blurred alike, so the outline keeps its colour. The
-    shadow ratio is averaged over the ground that is seen, so what lies below the object's edge has
-    the ratio beside it, and no light leaks in at the contact.
+    Premultiplied colours and the matte are blurred alike, so the outline keeps its colour. What
+    `GROUND` names is averaged over the ground that is seen, so what lies below the object's edge
+    has the ratio beside it, and no light leaks in at the contact.
 
     Args:
-        planes: ``matte`` [H, W], ``shadow_ratio`` [H, W, 3] and the planes of ``summed``.
+        planes: ``matte`` [H, W], the planes of ``summed`` and any of `GROUND` [H, W, 3].
         sigma: Standard deviation [px].
         summed: Names of premultiplied planes, [H, W, 3].
 
@@ -224,15 +226,17 @@ def blurred_layers(
     if sigma <= 0.0 or planes["matte"].size == 0:
         return planes
     seen = 1.0 - planes["matte"]
-    # In differences from 1, so that ground beyond the shadow stays exactly 1.
-    hidden = (planes["shadow_ratio"] - 1.0) * seen[..., None]
+    ground = {name: outside for name, outside in GROUND.items() if name in planes}
+    # In differences, so that ground beyond the shadow stays exactly 1.
+    changes = [(planes[name] - outside) * seen[..., None] for name, outside in ground.items()]
     names = (*summed, "matte")
-    clear = [*(planes[name] for name in names), seen, hidden]
-    *shown, weight, change = on_cores(lambda plane: gaussian(plane, sigma), clear)
-    result = dict(zip(names, shown, strict=True))
-    weight = weight[..., None]
-    ratio = 1.0 + change / np.maximum(weight, 1e-6)
-    inside = weight[..., 0] < 1e-3
-    ratio[inside] = planes["shadow_ratio"][inside]
-    result["shadow_ratio"] = np.maximum(ratio, 0.0).astype(np.float32)
+    clear = [*(planes[name] for name in names), seen, *changes]
+    blurred = on_cores(lambda plane: gaussian(plane, sigma), clear)
+    result = dict(zip(names, blurred[: len(names)], strict=True))
+    weight, *changes = blurred[len(names) :]
+    inside = weight < 1e-3
+    for (name, outside), change in zip(ground.items(), changes, strict=True):
+        mean = outside + change / np.maximum(weight[..., None], 1e-6)
+        mean[inside] = planes[name][inside]
+        result[name] = np.maximum(mean, 0.0).astype(np.float32)
     return planes | result

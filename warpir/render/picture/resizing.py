@@ -4,13 +4,12 @@ import numpy as np
 
 from warpir.core.arrays import FloatArray
 from warpir.io.images.resize import resize
+from warpir.look.sharpness import GROUND
 
 SLIVER = 1e-4
 """Share of a pixel below which its surface layers are left empty [1]."""
-GROUND = {"shadow_ratio": 1.0, "image": 0.0, "hidden": 0.0, "kept": 0.0}
-"""Planes of the ground that is seen, and what they hold where the object hides all of it."""
 LEAST_GROUND = 1e-3
-"""Share of ground in a pixel below which these planes go back to that [1]."""
+"""Share of ground in a pixel below which the planes of `GROUND` end [1]."""
 
 
 def resize_planes(planes: dict[str, FloatArray], height: int, width: int) -> dict[str, FloatArray]:
