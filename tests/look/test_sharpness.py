@@ -5,6 +5,7 @@ import pytest
 from scipy import ndimage
 
 from warpir.core.arrays import FloatArray
+from warpir.io.images.resize import resize
 from warpir.look.camera_look import CameraLook, region_around
 from warpir.look.sharpness import (
     PIXEL_SIGMA,
@@ -156,6 +157,21 @@ def test_nothing_is_sharpened() -> None:
     assert look.blur_to_add() == pytest.approx(np.sqrt(0.64 - 1 / 12))
     assert look.blur_to_add(enlarged=4.0) == 0.0
     assert CameraLook(blur=EdgeBlur(0.1, 100)).blur_to_add() == 0.0
+
+
+@pytest.mark.parametrize("larger", [2, 3, 4])
+@pytest.mark.parametrize("sigma", [0.47, 0.6, 0.8, 1.2])
+def test_what_is_averaged_down_is_as_sharp_as_the_photo(sigma: float, larger: int) -> None:
+    """A step rendered larger has the blur that is asked for, within 6 %."""
+    variance = 0.0
+    for place in np.linspace(31.0, 32.0, 8, endpoint=False):
+        step = np.clip(np.arange(64 * larger) + 1.0 - place * larger, 0.0, 1.0)
+        step = resize(np.tile(step.astype(np.float32), (64 * larger, 1)), 64, 64)
+        added = CameraLook(blur=EdgeBlur(sigma, 100)).blur_to_add(1.0 / larger)
+        slope = np.diff(gaussian(step, added)[32].astype(np.float64))
+        x = np.arange(63)
+        variance += slope @ x**2 - (slope @ x) ** 2 - 1 / 12  # the difference blurs as a pixel does
+    assert np.sqrt(variance / 8.0) == pytest.approx(sigma, rel=0.06)
 
 
 def test_region_is_three_times_the_box() -> None:

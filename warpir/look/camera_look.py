@@ -19,6 +19,8 @@ from warpir.look.texture import read_texture
 
 UPSAMPLED = 2.5
 """Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
+DOWNSAMPLED = 2.0
+"""Variance of the tent by which a larger rendering is averaged, over that of a pixel [1]."""
 FAINT = 1e-4
 """Coverage and darkening below which the blurred object and shadow end [1]."""
 SUMMED = ("foreground", "diffuse", "specular", "emission")
@@ -48,6 +50,8 @@ class CameraLook:
         own = PIXEL_SIGMA**2
         if enlarged > 1.0:
             own *= UPSAMPLED * enlarged**2
+        elif enlarged < 1.0:
+            own *= DOWNSAMPLED + enlarged**2
         return float(np.sqrt(max(self.blur.sigma**2 - own, 0.0)))
 
     def sharpened_like_photo(
