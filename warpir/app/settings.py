@@ -208,7 +208,8 @@ class RenderConfig:
     """Longest light path, in surface hits"""
     indirect_limit: float = option(8.0, "RADIANCE", low=0)
     """Most radiance after a path's first bounce (0: any); the limit, lower for what is thrown onto
-    dark ground, removes bright specks where a mirror throws sunlight"""
+    dark ground and higher on a linear plate whose white is above 1, removes bright specks where a
+    mirror throws sunlight"""
     bounce: bool = option(True, expert=True)
     """Let the object throw light on the ground; what it reflects and emits there is in the shadow
     ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""

@@ -90,7 +90,9 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
         lit.on_object,
         lit.light_shadow,
         inputs.photo,
-        Quality(PREVIEW_SAMPLES, 1, PREVIEW_DEPTH, config.render.seed, PREVIEW_LIMIT),
+        Quality(
+            PREVIEW_SAMPLES, 1, PREVIEW_DEPTH, config.render.seed, PREVIEW_LIMIT * inputs.photo.unit
+        ),
         lit.curves,
         occluder=inputs.occluder,
         look=look_of_preview(inputs.photo, config.look.response),

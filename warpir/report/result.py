@@ -163,7 +163,7 @@ def _picture(
             rays,
             quality.depth,
             quality.seed,
-            quality.indirect_limit,
+            quality.indirect_limit * inputs.photo.unit,
             is_denoised=quality.denoise == "auto" and denoiser_version() is not None,
             ground_roughness=quality.coat_roughness,
         ),

@@ -1,11 +1,13 @@
 """Light that the object throws onto the receiver: closed forms, furnaces, and both integrators."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tests.builders.insertions import arguments, go, read_layers, rgb, write_inputs
 from tests.builders.shapes import all_pixels, box, camera, constant, ground, lobe, placed, quad
 from tests.oracles import sg_irradiance
 from tests.render.test_transport import (
@@ -23,6 +25,7 @@ from tests.render.test_transport import (
     scene_of,
 )
 from warpir.core.arrays import Float64Array
+from warpir.io.images.writers import exr_bytes
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
 from warpir.render.launches import THROWN_SHARE
@@ -247,3 +250,22 @@ def test_bounce_of_transport_adds_what_glows(device: str) -> None:
     truth = reference.radiance(dark, dark, 1)
     assert float(truth.lit.max()) > 0.2 and bool((truth.unoccluded == 0.0).all())
     assert float(own.lit.sum()) == pytest.approx(float(truth.lit.sum()), rel=0.02)
+
+
+def test_light_on_ground_of_a_plate_does_not_depend_on_its_unit(tmp_path: Path) -> None:
+    """In numbers 1000 times as large, a plate keeps what the object throws and reflects."""
+    write_inputs(tmp_path)
+    values = np.random.default_rng(5).uniform(0.2, 1.0, (32, 48, 3)).astype(np.float32)
+    found = []
+    for unit in (2.0, 2000.0):
+        out = tmp_path / f"{unit:.0f}"
+        plate = tmp_path / f"{unit:.0f}.exr"
+        planes = {name: unit * values[..., k] for k, name in enumerate("RGB")}
+        plate.write_bytes(exr_bytes(plate, planes))
+        more = {"samples": "64", "sharpness": "off", "grain": "off", "tone": "linear"}
+        go(arguments(tmp_path, out, photo=str(plate), **more), out)
+        layers = read_layers(out / "layers.exr")
+        found.append((rgb(layers, "shadow."), rgb(layers, "fg.") / unit))
+    for small, large in zip(*found, strict=True):
+        np.testing.assert_allclose(large, small, atol=2e-3)
+    assert found[0][0].max() > 1.01

@@ -71,6 +71,11 @@ class Photo:
         step = math.ceil(math.sqrt(self.codes.size / EXPOSED_BY))
         return float(2.0 ** color.expose(self.codes[::step, ::step])[1])
 
+    @property
+    def unit(self) -> float:
+        """Radiance that is as much as 1 in a photograph [1]: more in a plate of larger numbers."""
+        return max(1.0, 1.0 / self.exposure)
+
     def exposed(self) -> tuple[FloatArray, float]:
         """Return what the estimators look at, and by what its light is to be divided.
 
