@@ -519,6 +519,8 @@ def test_report_is_made_anew_of_a_finished_folder(
     assert remake([str(copy)]) == ExitCode.OUTPUT
     assert remake([str(copy), "--overwrite"]) == ExitCode.OUTPUT
     assert remake([str(copy), "--to", str(tmp_path / "new.html")]) == ExitCode.OUTPUT
+    record = ["--to", str(copy / "run.json"), "--overwrite"]
+    assert remake([str(copy), *record]) == ExitCode.OUTPUT
     assert outcome(copy) == before
     capsys.readouterr()
     (copy / "layers.exr").unlink()

@@ -57,8 +57,9 @@ def _run(arguments: list[str]) -> int:
         # A file of unknown origin may hold anything under the names that a run writes.
         what = f"not what a run of this version writes ({type(error).__name__}: {error})"
         raise InputError(given.folder / "run.json", what) from error
-    if path.name in results.files and is_beside:
-        # Its hash stands in run.json, by which others see that the results are unchanged.
+    folder = given.folder.resolve()
+    if path.resolve() in [folder / name for name in (*results.files, "run.json")]:
+        # Hashes stand in run.json, by which others see that the results are unchanged.
         raise InputError(
             path, "is of the run itself", "name another file with --to", ExitCode.OUTPUT
         )
