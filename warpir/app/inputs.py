@@ -424,11 +424,11 @@ def read_asset(inputs: InputConfig, limits: Limits, loaders: Loaders, log: Log) 
     """
     assert inputs.asset is not None
     asset = loaders.asset(inputs.asset, inputs.missing_textures, limits)
-    if inputs.asset_up is not None:
+    if inputs.asset_up not in (None, "y", "+y"):
         turned = f"turned: its {inputs.asset_up} axis points up (--asset-up)"
         asset = asset.turned(up_to_y(inputs.asset_up))
         asset = replace(asset, notices=(*asset.notices, turned))
-    elif Path(inputs.asset).suffix.lower() not in STATED_UP:
+    elif inputs.asset_up is None and Path(inputs.asset).suffix.lower() not in STATED_UP:
         log.assume("the asset's +y axis points up (--asset-up)")
     if inputs.materials is not None:
         asset = with_materials(asset, inputs.materials, limits)
