@@ -1,6 +1,7 @@
 """The page's light: estimated from the photo, and without a direction where none is clear."""
 
 import json
+import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -74,6 +75,23 @@ def test_worker_answers_refuses_and_starts_again(inputs: Path, worker: Worker) -
     assert worker.ask(job)["spread_deg"] > 0.0
     worker.stop()
     assert worker.ask(job)["spread_deg"] > 0.0
+
+
+def test_worker_that_is_closed_while_it_starts_is_ended() -> None:
+    """Ctrl-C then leaves no process behind that works on and finds nobody to answer to."""
+
+    class Closed(Worker):
+        def _running(self) -> subprocess.Popen[str]:
+            process = super()._running()
+            self._process = None  # as `close` finds it while the process is being started
+            self.close()
+            self._process = process
+            return process
+
+    closed = Closed()
+    with pytest.raises(InputError, match="stopped before it was done"):
+        closed.ask({"kind": "none"})
+    assert not closed.is_running
 
 
 @pytest.mark.slow

@@ -44,9 +44,10 @@ class Worker:
             InputError: The job cannot be done, or was cancelled (`ExitCode.RESOURCES`).
         """
         with self._is_asked:
-            if self._is_closed:
+            process = None if self._is_closed else self._running()
+            if process is None or self._is_closed:  # or while the process was being started
+                self.stop()
                 raise InputError("the page", "stopped before it was done", "", ExitCode.RESOURCES)
-            process = self._running()
             self._job += 1
             self._kind = job["kind"]
             assert process.stdin is not None and process.stdout is not None
