@@ -378,8 +378,10 @@ def test_who_misses_a_catch_pair_is_excluded_and_shown(
     out = capsys.readouterr().out
     assert "2 raters, without the 1 excluded" in out
     assert "all 3 raters, with the 1 excluded" in out
-    # Two may be missed where that was said before.
+    assert "nobody can be excluded" not in out
+    # As many may be missed as was said before; of all that there are, a notice says so.
     study = make(scenes, tmp_path / "lenient", "--catch-misses", "1")
+    assert "allows every catch pair, so nobody can be excluded" in capsys.readouterr().out
     lenient = [sheet_of(study.plan, k, lambda pair: pair != catch) for k in range(3)]
     write_answers(tmp_path / "lenient", lenient)
     assert score(tmp_path / "lenient")["sheets"]["excluded"] == []

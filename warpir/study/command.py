@@ -164,6 +164,8 @@ def _make(options: argparse.Namespace) -> None:
     )
     if not catches:
         say("notice: no catch pairs, so nobody can be excluded")
+    elif options.catch_misses >= catches:
+        say("notice: --catch-misses allows every catch pair, so nobody can be excluded")
     say(f"{out / PAGES} may be published; {out / KEY} must not")
 
 
