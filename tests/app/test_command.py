@@ -782,6 +782,10 @@ def test_flags_without_effect_are_said(
     assert warpir.insert.main([*scene, *unread, "--validate"]) == ExitCode.DONE
     (line,) = [s for s in capsys.readouterr().out.splitlines() if "without effect" in s]
     assert {*line.partition("guides: ")[2].split(", ")} == {s for s in unread if s[:2] == "--"}
+    unlit = [*scene[: scene.index("--light")], *scene[scene.index("--out") :]]
+    for argv, count in (scene, 1), ([*unlit, "--start", "uniform"], 1), (unlit, 0):
+        assert warpir.insert.main([*argv, "--no-visible-sun", "--validate"]) == ExitCode.DONE
+        assert capsys.readouterr().out.count("--no-visible-sun: without effect") == count
 
 
 @pytest.mark.parametrize(

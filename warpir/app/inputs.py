@@ -373,6 +373,9 @@ def _without_effect(config: InsertConfig) -> Iterator[str]:
             yield f"without effect {why}: {', '.join(given)}"
     if config.light.reuse is not None and config.light.ground_albedo is not None:
         yield "--ground-albedo: without effect on the light of --reuse (--exposure)"
+    is_given = config.light.is_described or config.light.reuse or config.light.start == "uniform"
+    if is_given and not config.light.visible_sun and not config.is_guided:
+        yield "--no-visible-sun: without effect where the light is not estimated from the photo"
 
 
 PICTURES = ("photo", "occluder_mask", "shadow_mask", "light")
