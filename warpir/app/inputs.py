@@ -364,8 +364,7 @@ def _without_effect(config: InsertConfig) -> Iterator[str]:
     unread = [*unread_by_loss(config), *unread_by_loop(config)]
     if not config.is_guided:
         parts = ("guidance", "diffusion", "adapter", "optimize")
-        of_a_model = [name for part in parts for name in fields_of(part)]
-        unread = [("where no model guides", " ".join(of_a_model))]
+        unread = [("where no model guides", " ".join(n for p in parts for n in fields_of(p)))]
     values = config.flat()
     for why, names in unread:
         given = [flag(name) for name in names.split() if values[name] != DEFAULTS[name]]
