@@ -78,6 +78,7 @@ def test_a_misjudged_camera_keeps_its_yaw() -> None:
 
 def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> None:
     """Logits at each member's temperature and levels are averaged; disagreement adds variance."""
+    torch.manual_seed(0)  # one of a hundred draws has a variance at which logarithms are cut
     paths, networks = [], []
     for seed, temperature in ((0, 2.0), (1, 0.5)):
         network = random_regressor(seed, SMALL)
