@@ -547,6 +547,12 @@ def test_picture_of_a_shaded_place(files: Path, device: str) -> None:
     deep = plain[..., 0] < 0.5
     deep[:18] = False
     assert deep.sum() > 10
+    # Each ratio counts as much as the open ground's light that it is of.
+    sunny = Light(SUN, plain_sky((0.45, 0.62, 1.0), (0.2, 0.2, 0.2)))
+    up, share = np.array([0.0, 1.0, 0.0]), 128 / 255
+    kept = share * without_lamps(sunny).irradiance(up) / sunny.irradiance(up)
+    share = kept / (1.0 - share + kept)
+    np.testing.assert_allclose(half, plain + share * (white - plain), atol=1e-5)
     np.testing.assert_allclose(half[deep].mean(axis=0), dimmed[deep].mean(axis=0), atol=0.012)
     for ratio, light in ((white, dim), (walled, dark)):
         assert ratio[deep].mean() > plain[deep].mean() + 0.3 and light < 0.95 * lit
