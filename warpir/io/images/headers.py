@@ -11,6 +11,7 @@ import numpy as np
 
 from warpir.core import color
 from warpir.core.errors import InputError
+from warpir.io.images.kinds import start_of
 
 EXPOSURE_LIMIT = 1e12
 """Largest product of a Radiance file's exposures, and its inverse the least [1]."""
@@ -78,7 +79,7 @@ def without_gain_map(path: Path, kind: str) -> Iterator[Path]:
     Its half floats of an Ultra HDR picture are display light up to several times white; the photo
     that people see, and all other programs open, is the base image.
     """
-    content = path.read_bytes() if kind == "jpeg" else b""
+    content = start_of(path) if kind == "jpeg" else b""
     if _ULTRA_HDR not in content:
         yield path
         return

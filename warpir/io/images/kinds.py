@@ -21,6 +21,8 @@ _MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
 """Start of a segment of a JPEG, which its length follows (ITU-T T.81, B.1.1); between a scan's
 header and the next one stands its data, in which a byte of 255 is followed by none of these."""
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_MOST_READ = 1 << 28
+"""More than a picture has that is not refused for its pixels [byte]; a phone may append a film."""
 _MOST_SCANS = 100
 """Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
 
@@ -77,6 +79,12 @@ def sniff(path: Path) -> tuple[str, bytes]:
     )
 
 
+def start_of(path: Path) -> bytes:
+    """Return what is looked at of a JPEG, `_MOST_READ` bytes at most."""
+    with path.open("rb") as stream:
+        return stream.read(_MOST_READ)
+
+
 def check_scans(path: Path) -> None:
     """Refuse a JPEG of so many scans that it takes minutes to decode.
 
@@ -85,7 +93,7 @@ def check_scans(path: Path) -> None:
     Raises:
         InputError: More than `_MOST_SCANS`.
     """
-    content = path.read_bytes()
+    content = start_of(path)
     scans, at = 0, 2
     while (found := _MARKER.search(content, at)) and (marker := found[0][1]) != _END_OF_IMAGE:
         scans += marker == _START_OF_SCAN
