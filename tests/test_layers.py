@@ -27,7 +27,7 @@ DIRECTION = (
 RANK = {room: rank for rank, rooms in enumerate(DIRECTION) for room in rooms}
 KERNELS_IN = {"render", "train"}
 """Who launches kernels; `warpir.kernels` itself sees Warp and nothing else."""
-NETWORKS_IN = {"optimize", "train", "evaluate"}
+NETWORKS_IN = {"optimize"}
 """Who drives the networks of `warpir.diffusion`, which itself sees `warpir.core` alone."""
 PLAIN = {"settings", "prompts", "model_error", "model_folder", "hub", "weight_files"}
 """Modules of `warpir.diffusion` for every room: words, settings and files; torch is not loaded."""

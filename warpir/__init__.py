@@ -11,16 +11,23 @@ Conventions, one for the whole project:
 * ``wo`` points toward the camera, ``wi`` toward the light.
 * Angles are degrees at the command line and in files, radians inside.
 
-The rooms, each of which imports only those before it (tests/test_layers.py):
+The rooms, each of which imports only those of lines before it (tests/test_layers.py):
 
-    core       errors, limits, colour, files           scene     records of what is in the picture
-    io         every byte in or out                    app       what was asked, checked once
-    render     Warp: radiance, shadow ratio, composite lighting  where a light comes from
-    optimize   the guided loop                         report    the page of a run
-    sequence, place, batch, study, evaluate, train, mitsuba      one command or tool each
+    core         errors, limits, colour, files
+    scene        records of what is in the picture
+    io           every byte in or out
+    look         what the camera did to the photo, done to the object
+    app          what was asked, checked once
+    demo         the scene that ships with warpir
+    render       Warp: radiance, shadow ratio, composite; calibration: the camera of a photo
+    lighting     where a light comes from
+    optimize     the guided loop; report: the page of a run
+    sequence, place, mitsuba, train     one tool each
+    insert       a run: read, light, guide, render, write
+    batch, evaluate, study, check_model     commands above it
 
 `warpir.kernels` holds the device code and knows no room; `warpir.diffusion` the priors and their
-losses, which know the core alone. ``insert.py`` tells the story.
+losses, which know the core alone.
 """
 
 import importlib.util

@@ -1,4 +1,5 @@
 """From scene and light to radiance, shadow ratio and composite, with gradients.
 
-The only room that imports Warp; knows nothing of where a light comes from or what judges a picture.
+Imports Warp, as only `warpir.train` does beside it; knows nothing of where a light comes from or of
+what judges a picture.
 """

@@ -1,4 +1,4 @@
 """Results of a run: the final render, its files and the report.
 
-The report reads the files of a run and renders nothing.
+`result` renders; the page reads the files of a run and renders nothing.
 """
