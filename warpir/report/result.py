@@ -40,6 +40,9 @@ NOT_HANDED_OVER = (
     "the files for Blender, three.js and Mitsuba hold the light from afar alone, not the lamps "
     "near the object (--usd has them)"
 )
+NO_MESH_HANDED_OVER = (
+    "the files for Blender, three.js and Mitsuba hold the ground plane, not the mesh of --proxy"
+)
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
 PREVIEW_SIDE = 900
@@ -256,6 +259,8 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     _say_what_is_seen(run, summary, picture)
     if inputs.lamps and (asked.hand_off or asked.mitsuba):
         run.log.notice(NOT_HANDED_OVER)
+    if inputs.proxy is not None and asked.hand_off:
+        run.log.notice(NO_MESH_HANDED_OVER)
     measured = {
         **_measured(run, light, summary),
         **({"lamps": records_of(inputs.lamps)} if inputs.lamps else {}),

@@ -42,6 +42,7 @@ from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
+from warpir.report.result import NO_MESH_HANDED_OVER
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import lamp_axes, without_lamps
@@ -597,6 +598,15 @@ def test_notices_of_a_place(
     argv = arguments(files, tmp_path / "o", proxy=str(files / "wall.glb"), place="0,0,-9")
     assert main([*argv, "--validate"]) == ExitCode.DONE
     assert "hides the object" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("flags", [{}, {"no_hand_off": ""}], ids=str)
+def test_files_for_other_tools_without_the_mesh_are_told(
+    files: Path, tmp_path: Path, flags: dict[str, str]
+) -> None:
+    out = tmp_path / "o"
+    run = go(arguments(files, out, proxy=str(files / "wall.glb"), samples="1", **flags), out)
+    assert (NO_MESH_HANDED_OVER in run.record["notices"]) == (not flags)
 
 
 def test_exposure_looks_at_ground_that_the_sun_reaches(files: Path) -> None:
