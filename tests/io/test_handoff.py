@@ -391,6 +391,11 @@ def test_blender_script_is_short_and_its_numbers_are_ours(
     scene = inputs.asset, inputs.camera, inputs.placement
     script = handoff.blender_setup(*scene, "envmap.exr", [sun])
     compile(script, "blender_setup.py", "exec")
+    window = replace(inputs.asset, materials=(Material(transmission=1.0),))
+    for asset, is_thin in ((window, True), (inputs.asset, False)):
+        built = handoff.blender_setup(asset, *scene[1:], "envmap.exr", [sun])
+        compile(built, "blender_setup.py", "exec")
+        assert ("thin_walls(" in built) == is_thin
     assert script.count("\n") <= 120 and "$" not in script and str(folder) not in script
     values = constants(script)
     assert (values["PHOTO"], values["ENVMAP"], values["OBJECT"]) == (

@@ -152,8 +152,11 @@ def blender_setup(
     ground = affine_matrix(y_to(normal), middle - normal * (normal @ middle + offset))
     distance = float(np.linalg.norm(middle - camera.c2w[:3, 3]))
     values = blender_camera(camera)
-    template = Template(files("warpir.io").joinpath("blender_setup.py.in").read_text("utf-8"))
-    return template.substitute(
+    parts = ["blender_setup.py.in"]
+    if any(m.transmission > 0.0 and not m.is_solid_glass for m in asset.materials):
+        parts.append("blender_glass.py.in")
+    texts = [files("warpir.io").joinpath(name).read_text("utf-8") for name in parts]
+    return Template("".join(texts)).substitute(
         version=warpir.__version__,
         photo=PHOTO,
         envmap=envmap,
