@@ -1,7 +1,7 @@
 """The scene's compositor: Cycles' render over the photo as its camera saw it, or warpir's layers.
 
 warpir's linear light is that of gamma 2.2; the last node hands the codes to the view transform
-Standard, which would encode them by the sRGB curve.
+Standard, which would encode them by the sRGB curve, as it does the light of a scene-linear plate.
 """
 
 from pathlib import Path
@@ -80,17 +80,18 @@ class Graph:
         self.tree.links.new(color, node.inputs["Image"])
         return node.outputs[0]
 
-    def show(self, display: Any) -> None:
-        """Make display values the scene's picture."""
-        spaces = {"from_color_space": "sRGB", "to_color_space": "Linear Rec.709"}
-        picture = self.value("ConvertColorSpace", "codes", display, **spaces)
+    def show(self, picture: Any, is_display: bool = True) -> None:
+        """Make display values, or else linear ones, the scene's picture."""
+        if is_display:
+            spaces = {"from_color_space": "sRGB", "to_color_space": "Linear Rec.709"}
+            picture = self.value("ConvertColorSpace", "codes", picture, **spaces)
         kind = "NodeGroupOutput" if self.is_group else "CompositorNodeComposite"
         ends = [node for node in self.tree.nodes if node.bl_idname == kind]
         self.tree.links.new(picture, (ends or [self.tree.nodes.new(kind)])[0].inputs[0])
 
 
-def show_layers(scene: Any, layers: Path) -> None:
-    """Compose ``layers.exr`` by the formula of docs/handoff.md."""
+def show_layers(scene: Any, layers: Path, is_plate: bool) -> None:
+    """Compose ``layers.exr`` by the formula of docs/handoff.md; a scene-linear plate stays so."""
     graph = Graph(scene)
     planes = graph.node("Image", "layers", image=bpy.data.images.load(str(layers))).outputs
     behind = graph.mix("MULTIPLY", 1.0, planes["plate"], planes["shadow"])
@@ -100,7 +101,9 @@ def show_layers(scene: Any, layers: Path) -> None:
         picture = graph.mix("ADD", 1.0, picture, planes["mirror"])
     if "grain" in planes:
         picture = graph.mix("ADD", 1.0, picture, planes["grain"])
-    graph.show(graph.value("Gamma", "display", picture, 1.0 / GAMMA))
+    if not is_plate:
+        picture = graph.value("Gamma", "display", picture, 1.0 / GAMMA)
+    graph.show(picture, is_display=not is_plate)
 
 
 def show_render(scene: Any, photo: Path, grain: Path, response: Path) -> None:

@@ -113,7 +113,8 @@ def show_insertion(scene: Any, folder: Path) -> None:
     result, render = folder / "result", scene.render
     render.resolution_x, render.resolution_y = photo_of(scene)[0].image.size
     render.resolution_percentage = 100
-    compositor.show_layers(scene, result / "layers.exr")
+    curves = json.loads((result / "curves.json").read_text("utf-8"))
+    compositor.show_layers(scene, result / "layers.exr", not curves.get("is_clipped", True))
     planes = scene.camera.data.background_images
     plane = next((b for b in planes if b.image and OWN in b.image), None) or planes.new()
     plane.image = bpy.data.images.load(str(result / "composite.png"))

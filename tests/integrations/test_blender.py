@@ -24,6 +24,7 @@ from PIL import Image
 
 import warpir.demo
 from tests.io.test_handoff import BLENDER, planes_of, stacked
+from warpir.core.color import linear_to_srgb
 from warpir.io.cameras.reader import read_camera
 from warpir.io.export import tone_curve_cube
 from warpir.look.response import Response
@@ -252,6 +253,8 @@ def render(path, file_format, mode, depth):
 scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 64, False
 render("layers.png", "PNG", "RGB", "8")
 compositor = importlib.import_module(name + ".compositor")
+compositor.show_layers(scene, Path(saw["result"], "layers.exr"), True)
+render("plate.png", "PNG", "RGB", "8")
 files = estimate / "photo.png", estimate.parent / "grain.exr", estimate / "response.cube"
 compositor.show_render(scene, *files)
 render("cycles.png", "PNG", "RGB", "8")
@@ -372,6 +375,8 @@ def test_blender_renders_what_warpir_composed(seen: tuple[Path, dict[str, Any]])
 
     composite, photo = codes_of(result / "composite.png"), codes_of(out / "photo.png")
     assert np.abs(codes_of(out / "layers.png") - composite).max() <= 1
+    as_plate = 255.0 * linear_to_srgb(np.clip(stacked(layers, "", "RGB"), 0.0, 1.0))
+    assert np.abs(codes_of(out / "plate.png") - as_plate).max() <= 1.5
     cycles = codes_of(out / "cycles.png")
     changed = (composite != photo).any(axis=-1)
     assert np.corrcoef(cycles[changed].ravel(), composite[changed].ravel())[0, 1] > 0.97
