@@ -148,8 +148,11 @@ class InsertObject:
 
     @classmethod
     def INPUT_TYPES(cls) -> Spec:
-        def number(default: float, low: float, high: float, tip: str) -> tuple[Any, ...]:
-            about = {"default": default, "min": low, "max": high, "step": 0.01, "tooltip": tip}
+        def number(
+            default: float, low: float, high: float, tip: str, step: float = 0.01
+        ) -> tuple[Any, ...]:
+            # The front end rounds what is typed to the step's decimals
+            about = {"default": default, "min": low, "max": high, "step": step, "tooltip": tip}
             return ("FLOAT", about)
 
         def text(tip: str) -> tuple[Any, ...]:
@@ -162,8 +165,8 @@ class InsertObject:
                 "asset": ("STRING", {"default": "", "tooltip": tips}),
             },
             "optional": {
-                "at_x": number(-1.0, -1.0, 1.0, "Column where it stands, a share; both -1: chosen"),
-                "at_y": number(-1.0, -1.0, 1.0, "Row of the ground where it stands, a share"),
+                "at_x": number(-1.0, -1.0, 1.0, "Column where it stands, share; -1: chosen", 1e-3),
+                "at_y": number(-1.0, -1.0, 1.0, "Row of the ground where it stands, a share", 1e-3),
                 "size": number(0.0, 0.0, 1000.0, "Its longest side [m]; 0: as the file has it"),
                 "rotate_y": number(0.0, -360.0, 360.0, "Turn about the vertical [deg]"),
                 "light": text("A light map; empty: estimated from the photo"),

@@ -68,6 +68,12 @@ def test_nodes_state_what_comfyui_asks_for(nodes: ModuleType) -> None:
             assert about["tooltip"]
 
 
+def test_a_place_is_rounded_to_thousandths(nodes: ModuleType) -> None:
+    """The front end rounds what is typed to the step's decimals: 1.3 pixels of 1280, not 12.8."""
+    known = nodes.NODE_CLASS_MAPPINGS["WarpirInsertObject"].INPUT_TYPES()["optional"]
+    assert all(known[name][1]["step"] == 0.001 for name in ("at_x", "at_y"))
+
+
 def test_example_fits_the_nodes(nodes: ModuleType) -> None:
     """Each link carries what its input takes, and nothing that is required is missing."""
     graph = json.loads((FOLDER / "insert_object.json").read_text())
