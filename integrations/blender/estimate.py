@@ -2,7 +2,7 @@
 
 Camera and light are those of an insertion, whose object is a box that stands in for what will come;
 ``FOLDER/result`` is an ordinary result. ``FOLDER/grain.exr`` is grain as strong as the photo's, in
-display values, where it has any.
+display values, where it has any, and ``FOLDER/turned`` is there if the photo's EXIF tag turns it.
 """
 
 import json
@@ -24,7 +24,16 @@ def run(photo: str, folder: Path, flags: list[str]) -> int:
     status = main([*named, *QUICK, *flags])
     if status == 0:
         write_grain(folder / "result", folder / "grain.exr")
+        if is_turned(photo):
+            (folder / "turned").touch()
     return status
+
+
+def is_turned(photo: str) -> bool:
+    """Return whether the file's pixels are not upright, by its EXIF tag."""
+    import OpenImageIO as oiio
+
+    return bool(oiio.ImageBuf(photo).spec().get_int_attribute("Orientation", 1) > 1)
 
 
 def write_grain(result: Path, path: Path) -> None:

@@ -73,7 +73,8 @@ def show_estimate(scene: Any, folder: Path) -> None:
     script["set_up"](scene, scene.camera, has_object=False, has_suns=True)
     for thing in set(scene.objects) - before:
         thing[OWN] = True
-    if tuple(background.image.size) != (script["WIDTH"], script["HEIGHT"]):
+    size = script["WIDTH"], script["HEIGHT"]
+    if (folder / "turned").exists() or tuple(background.image.size) != size:
         # Blender does not turn pictures by their EXIF tag: this one is upright.
         background.image = bpy.data.images.load(str(result / script["PHOTO"]))
     files = result / script["PHOTO"], folder / "grain.exr", result / "response.cube"

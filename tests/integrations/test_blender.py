@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 import time
@@ -124,6 +125,17 @@ def test_job_needs_a_python(job: ModuleType, tmp_path: Path) -> None:
     for python in ("", str(tmp_path / "python")):
         with pytest.raises(job.Failure, match="preferences"):
             job.Job(python, [], tmp_path)
+
+
+def test_a_photo_upside_down_is_known(tmp_path: Path) -> None:
+    """It is as wide and high as its upright self, which Blender has to be given in its place."""
+    estimate = runpy.run_path(str(FOLDER / "estimate.py"))
+    exif = Image.Exif()
+    exif[0x112] = 3
+    Image.new("RGB", (48, 32)).save(tmp_path / "turned.jpg", exif=exif)
+    Image.new("RGB", (48, 32)).save(tmp_path / "upright.jpg")
+    assert estimate["is_turned"](str(tmp_path / "turned.jpg"))
+    assert not estimate["is_turned"](str(tmp_path / "upright.jpg"))
 
 
 def test_flags_go_to_their_own_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
