@@ -664,6 +664,27 @@ def test_mitsuba_renders_our_insertion_to_within_its_noise(folder: Path) -> None
     assert (view.width, view.height) == difference.shape[1::-1]
 
 
+OF_A_PLATE = """
+import sys
+from pathlib import Path
+import numpy as np
+from warpir.mitsuba.render import Composite, write_composite
+
+mean = np.linspace(0.0, 1.2, 48).reshape(4, 4, 3)
+write_composite(Path(sys.argv[1]), Composite(mean, 0.0 * mean), True)
+"""
+
+
+@WITHOUT_MITSUBA
+@pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
+def test_mitsuba_encodes_a_linear_plate_as_the_run_does(tmp_path: Path) -> None:
+    """By the sRGB curve, which photos are not linearised by."""
+    output_of(sys.executable, "-c", OF_A_PLATE, str(tmp_path / "o"), **{LIBRARY: str(llvm())})
+    encoded = colour.cctf_encoding(np.linspace(0.0, 1.2, 48).clip(max=1.0))
+    codes = np.round(255.0 * encoded).reshape(4, 4, 3)
+    np.testing.assert_array_equal(read_image(tmp_path / "o.png")[0][..., :3], codes)
+
+
 HALF_STEP = 2.5e-4
 """Half a step of half numbers below 1: what the layers are rounded to."""
 

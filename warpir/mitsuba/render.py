@@ -23,7 +23,7 @@ if mi.variant() is None:
 
 
 from warpir.core.arrays import Float64Array, FloatArray
-from warpir.core.color import codes_of, linear_to_gamma
+from warpir.core.color import codes_of, linear_to_gamma, linear_to_srgb
 from warpir.io.assets import load_asset
 from warpir.io.cameras.reader import read_camera
 from warpir.io.curves_file import read_curves
@@ -441,12 +441,15 @@ def _light(folder: Path, name: str) -> FloatArray:
     return read_envmap(own if own.exists() else folder / "envmap.exr")
 
 
-def write_composite(path: Path, composite: Composite) -> None:
-    """Write ``<path>.png``, and ``<path>.exr`` with the standard error in ``error.R/G/B``."""
+def write_composite(path: Path, composite: Composite, is_plate: bool) -> None:
+    """Write ``<path>.png``, and ``<path>.exr`` with the standard error in ``error.R/G/B``.
+
+    The PNG of a scene-linear plate has the sRGB curve, as the run's own.
+    """
     names = [*"RGB", *(f"error.{c}" for c in "RGB")]
     pixels = np.concatenate(composite, axis=-1).astype(np.float32)
     mi.Bitmap(pixels, channel_names=names).write(str(path.with_suffix(".exr")))
-    codes = codes_of(linear_to_gamma(composite.mean))
+    codes = codes_of((linear_to_srgb if is_plate else linear_to_gamma)(composite.mean))
     path.with_suffix(".png").write_bytes(png_bytes(codes, None, True, "Rendered by Mitsuba 3"))
 
 
@@ -466,7 +469,7 @@ def main(
     options = parser.parse_args()
     composite = render_run(folder, ground, depth, options.samples, options.seed, bounce_depth)
     path = folder / "mitsuba" / "composite"
-    write_composite(path, composite)
+    write_composite(path, composite, not read_curves(folder / "curves.json").is_clipped)
     noisy = composite.error[composite.error > 0.0]
     print(f"{path}.png and .exr: standard error {np.median(noisy):.2g} in the median pixel")
 
