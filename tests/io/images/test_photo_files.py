@@ -30,6 +30,7 @@ from tests.builders.image_files import (
 from tests.builders.refusals import unreadable
 from tests.development_data import SHARED, needs_shared
 from warpir.core import color
+from warpir.core.arrays import Float64Array
 from warpir.core.errors import InputError
 from warpir.io.images import color_profile
 from warpir.io.images.photos import Photo, read_envmap, read_mask, read_photo
@@ -742,6 +743,37 @@ def test_wide_profiles_against_little_cms(
     assert np.abs(photo.srgb * 255.0 - referee)[inside].max() < 1.0
     back = photo.encode(photo.srgb, np.ones((16, 16), bool)).astype(float)
     assert np.abs(back - deep)[inside].max() <= (1.2 if dtype is np.uint16 else 0.0)
+
+
+def table_curve(values: Float64Array) -> bytes:
+    numbers = np.round(65535.0 * values).astype(">u2")
+    return b"curv\0\0\0\0" + struct.pack(">I", len(numbers)) + numbers.tobytes()
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        table_curve(np.linspace(-0.03, 1.03, 512).clip(0.0, 1.0) ** 2.2),
+        table_curve(np.linspace(0.0, 1.0, 4096) ** 2.6),
+        table_curve(np.empty(0)),
+    ],
+    ids=["clips", "flat-in-the-black", "linear-without-entries"],
+)
+def test_curves_of_screens_and_linear_ones_against_little_cms(
+    tmp_path: Path, rng: np.random.Generator, curve: bytes
+) -> None:
+    """Those that clip are flat at their ends, so that black and white have no code of their own."""
+    icc = color_profile.matrix_profile(P3, curve)
+    codes = rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    photo = read_photo(write_image(tmp_path / "p.tif", codes, ICCProfile=icc))
+    assert photo.icc == icc
+    np.testing.assert_array_equal(photo.codes, codes)
+    source = ImageCms.ImageCmsProfile(io.BytesIO(icc))
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
+    referee = np.asarray(ImageCms.profileToProfile(Image.fromarray(codes), source, srgb), float)
+    assert np.abs(photo.srgb * 255.0 - referee).max() < 1.0
+    deep = write_image(tmp_path / "deep.tif", codes.astype(np.uint16) * 257, ICCProfile=icc)
+    np.testing.assert_allclose(read_photo(deep).srgb, photo.srgb, atol=1e-5)
 
 
 @pytest.mark.case("I8")

@@ -26,6 +26,8 @@ _D50_XYZ = (0.9642, 1.0, 0.8249)
 """The same in XYZ, with the digits of the ICC specification."""
 _MOST_CONDITION = 100.0
 """Of the matrix of a profile's primaries; sRGB has 4.3, ProPhoto RGB 1.8."""
+_INNER, _ENDS = 0.01, 0.06
+"""How far codes may come back off, and black and white, where curves are flat that clip [1]."""
 _CICP_PRIMARIES = {1: "ITU-R BT.709", 9: "ITU-R BT.2020", 12: "P3-D65"}
 _CICP_CURVES = {
     4: (2.2,),
@@ -203,7 +205,8 @@ def convert_profile(
         return codes, srgb, None, ""
     # How far off the way back of thin primaries lies depends on the processor: they are looked at.
     back = srgb_to_profile(expected, icc) if _primaries_are_apart(icc) else None
-    if back is None or not np.allclose(back, probe, atol=0.01):  # a NaN is not close either
+    most = np.where((probe > 0.0) & (probe < 1.0), _INNER, _ENDS)
+    if back is None or not np.allclose(back, probe, atol=most):  # a NaN is not close either
         return codes, srgb, None, broken
     converted = _profile_to_srgb(srgb, icc)
     if converted is None or not np.isfinite(converted).all():
@@ -225,6 +228,7 @@ def _primaries_are_apart(icc: bytes) -> bool:
     return bool(np.linalg.cond(primaries) < _MOST_CONDITION)
 
 
+_NO_ENTRIES = b"curv" + bytes(8)
 _COLOR_TAGS = (
     *(b"A2B", b"B2A", b"wtpt", b"chad", b"rXYZ", b"gXYZ", b"bXYZ"),
     *(b"rTRC", b"gTRC", b"bTRC", b"kTRC"),
@@ -232,9 +236,13 @@ _COLOR_TAGS = (
 
 
 def _colors_alone(icc: bytes) -> bytes:
-    """Return a profile without its texts, whose lengths OpenColorIO believes, up to gigabytes."""
-    tags = _tags(icc).items()
-    return _packed(icc[:128], {name: tag for name, tag in tags if name.startswith(_COLOR_TAGS)})
+    """Return a profile without its texts, whose lengths OpenColorIO believes, up to gigabytes.
+
+    A curve without entries, which is linear, has a gamma in their place: OpenColorIO knows none.
+    """
+    tags = {name: tag for name, tag in _tags(icc).items() if name.startswith(_COLOR_TAGS)}
+    linear = {name: _parametric((1.0,)) for name, tag in tags.items() if tag[:12] == _NO_ENTRIES}
+    return _packed(icc[:128], tags | linear)
 
 
 def _tag_is_whole(tag: bytes) -> bool:
