@@ -72,6 +72,14 @@ def test_texture_decides_the_strength() -> None:
     assert as_told(flat, 0.0005) is None
 
 
+@pytest.mark.parametrize("codes", [16.0, 24.0])
+def test_heavy_grain_is_that_of_flat_patches(codes: float) -> None:
+    """The texture tells no more than about 4 codes of any; within a tenth."""
+    photo = noisy(Grain((0.5,), ((codes / 255.0,) * 3,), 0.4, 0.5)).astype(np.float32)
+    found = estimate_look(photo, gamma_to_linear(photo), None, "off").grain
+    assert found is not None and 255.0 * found.typical == pytest.approx(codes, rel=0.1)
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
 def test_luminance_has_its_share_of_the_grain(correlation: float) -> None:
     """Of drawn noise on mid grey, within 3 %."""

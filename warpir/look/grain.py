@@ -46,6 +46,9 @@ EXCESS = 1.3
 the noise of a sensor changes little over the display values of a picture."""
 WIDEST = 2.0
 """Largest standard deviation of the blur that stands for the grain's size [px]."""
+HEAVY = (3.0 / 255.0, 10.0 / 255.0)
+"""Luminance's grain by the texture and by flat patches beyond which these count [1]: the networks
+have seen up to 6 codes, and tell 4 of all that is stronger."""
 NEAR = 32
 """What is farther off changes nothing in JPEG [px]: two blocks of subsampled chroma."""
 
@@ -177,11 +180,13 @@ def as_told(grain: Grain | None, luminance: float) -> Grain | None:
 
     Args:
         grain: That of flat patches, whose levels, channels and size are kept, its median level
-            at the strength; None: without any.
+            at the strength, but for one beyond `HEAVY`; None: without any.
         luminance: Standard deviation of the luminance [1].
     """
     if luminance < LEAST:
         return None
+    if grain and luminance > HEAVY[0] and grain.of_luminance > HEAVY[1]:
+        return grain
     found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, 0.0)
     # Not that in the middle of the range, where a posterised picture may have none.
     median = float(np.median(np.mean(found.strength, axis=1)))
