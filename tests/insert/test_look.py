@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from tests.builders.image_files import matrix_profile
+from tests.builders.image_files import matrix_profile, write_image
 from tests.builders.insertions import (
     arguments,
     go,
@@ -107,3 +107,24 @@ def test_black_and_white_photo_has_a_grey_object(
     off = tmp_path / "off" / "out"
     colored_run = go(arguments(inputs, off, **words, response="off"), off)
     assert np.ptp(colored_run.image().astype(int), axis=-1).max() > 20
+
+
+@pytest.mark.parametrize("unit", [1.0 / 64.0, 64.0])
+def test_look_of_a_plate_is_that_of_every_unit(
+    inputs: Path, tmp_path: Path, device: str, unit: float
+) -> None:
+    """Blur, grain, and the layer of grain over the unit; its draw differs with the plate's bits."""
+    write_photographed(tmp_path / "photo.png", 16)
+    plate = (read_image(tmp_path / "photo.png")[0] / 65535.0) ** 2.2
+    found = []
+    for factor in (1.0, unit):
+        path = write_image(tmp_path / f"{factor:g}.exr", (factor * plate).astype(np.float32))
+        words = {"photo": str(path), "device": device, "exposure": f"{np.log2(factor):g}"}
+        run = go(arguments(inputs, tmp_path / f"{factor:g}", **words), tmp_path / f"{factor:g}")
+        layer = rgb(read_layers(run.out / "layers.exr"), "grain.")
+        found.append((run.record["measured"]["look"], layer[layer != 0.0].std() / factor))
+    (one, noise), (other, same_noise) = found
+    assert one["blur"]["edges"] == other["blur"]["edges"]
+    assert one["blur"]["sigma"] == pytest.approx(other["blur"]["sigma"], rel=1e-3)
+    np.testing.assert_allclose(one["grain"]["strength"], other["grain"]["strength"], rtol=1e-3)
+    assert noise == pytest.approx(same_noise, rel=0.1) and noise > 1e-3

@@ -116,7 +116,7 @@ def composite(
     changed = (layers.matte > 0.0) | (layers.shadow_ratio != 1.0).any(axis=-1)
     if layers.mirror is not None:
         changed |= (layers.mirror != 0.0).any(axis=-1)
-    layers = _with_grain(layers, look, changed, seed, photo.is_deep)
+    layers = _with_grain(layers, look, changed, seed, photo)
     image = by_pixel(linear_to_gamma, layers.composite)
     return Picture(layers, image, changed, *counts, look, cut)
 
@@ -162,13 +162,19 @@ def _layers(
 
 
 def _with_grain(
-    layers: Layers, look: CameraLook, changed: BoolArray, seed: int, is_deep: bool
+    layers: Layers, look: CameraLook, changed: BoolArray, seed: int, photo: Photo
 ) -> Layers:
     """Add the photo's grain to what has changed, in a layer of its own."""
-    grain = look.grain_on(layers.composite, layers.plate, layers.matte, changed, seed, GAMMA)
+    shown, plate = layers.composite, layers.plate
+    if photo.is_linear:  # its codes are those of the plate as it is exposed
+        exposure = np.float32(photo.exposure)
+        shown, plate = exposure * shown, exposure * plate
+    grain = look.grain_on(shown, plate, layers.matte, changed, seed, GAMMA)
     if grain is None:
         return layers
-    grain = grain if is_deep else by_pixel(_halves, grain)
+    if photo.is_linear:
+        grain /= exposure
+    grain = grain if photo.is_deep else by_pixel(_halves, grain)
     return replace(layers, composite=layers.composite + grain, grain=grain)
 
 

@@ -128,7 +128,8 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
     """Return what the camera did to the photo, as far as the object is to share it.
 
     A recovered tone curve was judged beside the photo, so it holds the response already; Reinhard's
-    operator has a shoulder of its own, and a linear plate has no response.
+    operator has a shoulder of its own, and a linear plate has no response. A plate of any unit is
+    looked at as it is exposed.
     """
     photo, asked = run.inputs.photo, run.config.look
     inputs = run.inputs
@@ -140,7 +141,9 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
     if response == "auto" and (is_shown or photo.is_linear):
         response = "off"
     words = asked.sharpness, asked.grain, response
-    look = estimate_look(photo.srgb, photo.linear(), around, *words, photo.jpeg)
+    shown, factor = photo.exposed()
+    linear = photo.linear() * np.float32(factor) if photo.is_linear else photo.linear()
+    look = estimate_look(shown, linear, around, *words, photo.jpeg)
     look = replace(look, is_grey=look_of_preview(photo, asked.response).is_grey)
     if "auto" in words or look.is_grey:
         run.log.assume(*look.lines())
