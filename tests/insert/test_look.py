@@ -128,3 +128,19 @@ def test_look_of_a_plate_is_that_of_every_unit(
     assert one["blur"]["sigma"] == pytest.approx(other["blur"]["sigma"], rel=1e-3)
     np.testing.assert_allclose(one["grain"]["strength"], other["grain"]["strength"], rtol=1e-3)
     assert noise == pytest.approx(same_noise, rel=0.1) and noise > 1e-3
+
+
+@pytest.mark.parametrize("grain", ["off", "2", "auto"])
+def test_given_values_are_not_assumed(
+    inputs: Path, tmp_path: Path, device: str, grain: str
+) -> None:
+    """Estimates alone are, and the file's blocks, which no value states."""
+    write_photographed(tmp_path / "photo.png", 8)
+    Image.open(tmp_path / "photo.png").save(tmp_path / "photo.jpg", quality=80)
+    words = {"sharpness": "1", "response": "1.1", "grain": grain, "device": device}
+    out = tmp_path / "out"
+    run = go(arguments(inputs, out, photo=str(tmp_path / "photo.jpg"), **words), out)
+    said = " ".join(run.record["assumed"])
+    assert "blurred" not in said and "contrast" not in said
+    assert ("has grain" in said) == (grain == "auto") and ("a JPEG" in said) == (grain != "off")
+    assert run.record["measured"]["look"]["blur"]["sigma"] == 1.0

@@ -145,8 +145,9 @@ def look_of(run: Run, light: SceneLight) -> CameraLook:
     linear = photo.linear() * np.float32(factor) if photo.is_linear else photo.linear()
     look = estimate_look(shown, linear, around, *words, photo.jpeg)
     look = replace(look, is_grey=look_of_preview(photo, asked.response).is_grey)
-    if "auto" in words or look.is_grey:
-        run.log.assume(*look.lines())
+    parts = zip(("blur", "grain", "response"), words, strict=True)
+    given: dict[str, Any] = {part: None for part, word in parts if word != "auto"}
+    run.log.assume(*replace(look, **given).lines())
     return look
 
 
