@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpir.core.arrays import BoolArray, FloatArray, by_pixel
+from warpir.core.arrays import BoolArray, FloatArray, PixelArray, by_pixel
 from warpir.core.color import GAMMA, linear_to_gamma
 from warpir.io.images.photos import Photo
 from warpir.io.layers import HALF_MAX, Layers
@@ -50,6 +50,13 @@ class Picture:
     """What the camera did to the photo, repeated on object and shadow."""
     mirror_cut_count: int = 0
     """Pixels whose ground hid more light in the mirror than the photo shows there."""
+
+    def codes_in(self, photo: Photo) -> PixelArray:
+        """Return the composite in the codes of its photo (`Photo.encode`)."""
+        kept = None
+        if photo.icc is not None:
+            kept = (np.float32(1.0) - self.layers.matte)[..., None] * self.layers.shadow_ratio
+        return photo.encode(self.image, self.changed, kept)
 
 
 def make_picture(

@@ -109,7 +109,7 @@ def write_preview(run: Run, light: SceneLight) -> None:
         asked = run.config.render
         renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
         picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1, look)
-        codes = run.inputs.photo.encode(picture.image, picture.changed)
+        codes = picture.codes_in(run.inputs.photo)
         run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
 
@@ -241,7 +241,7 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     """
     inputs, output, photo = run.inputs, run.output, run.inputs.photo
     asked = run.config.output
-    codes = photo.encode(picture.image, picture.changed)
+    codes = picture.codes_in(photo)
     # Many shadows are too faint for a code; a linear plate has no codes of the same kind.
     changed = picture.changed if photo.is_linear else (codes != photo.codes).any(axis=-1)
     maps, response = _maps_of(light), picture.look.response

@@ -656,6 +656,28 @@ def test_i8_display_p3_is_converted_and_comes_back(
     assert np.abs(back[inside].astype(int) - codes[inside]).max() <= 1
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colors_beyond_srgb_stay_in_the_shadow(
+    tmp_path: Path, rng: np.random.Generator, dtype: type
+) -> None:
+    """Ground that keeps its light keeps its codes, and half as much light keeps their hue."""
+    top = np.iinfo(dtype).max
+    codes = rng.integers(0, top + 1, (16, 16, 3)).astype(dtype)
+    codes[0, 0] = top, 0, 0
+    photo = read_photo(write_image(tmp_path / "p.tif", codes, ICCProfile=matrix_profile("p3")))
+    assert ((photo.srgb == 0.0) | (photo.srgb == 1.0)).any(axis=-1).mean() > 0.2
+    everywhere = np.ones((16, 16), bool)
+    for kept in (1.0, 0.5):
+        shown = photo.srgb * np.float32(kept ** (1.0 / 2.2))
+        edited = photo.encode(shown, everywhere, np.full(codes.shape, kept, np.float32))
+        # The profile's curve is 2.2 as well, but sRGB between is not quite. Clipped: off by .25.
+        expected = codes * kept ** (1.0 / 2.2)
+        assert np.abs(edited - expected).max() <= (1e-4 if kept == 1.0 else 0.08) * top
+        hidden = photo.encode(shown, everywhere, np.zeros(codes.shape, np.float32))
+        np.testing.assert_array_equal(hidden, photo.encode(shown, everywhere))
+    assert np.abs(photo.encode(photo.srgb, everywhere).astype(int) - codes).max() > 0.1 * top
+
+
 def test_only_changed_pixels_get_new_codes(tmp_path: Path, rng: np.random.Generator) -> None:
     codes = rng.integers(0, 65536, (8, 8, 3), dtype=np.uint16)
     photo = read_photo(write_image(tmp_path / "p.png", codes))

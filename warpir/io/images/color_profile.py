@@ -198,7 +198,7 @@ def convert_profile(
         return codes, srgb, None, broken
     probe = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 9, dtype=np.float32)] * 3), axis=-1)
     probe = probe.reshape(27, 27, 3)
-    expected = _profile_to_srgb(probe, icc)
+    expected = profile_to_srgb(probe, icc)
     if expected is None:
         return _convert_lut_profile(path, codes, srgb, icc)
     if float(np.abs(expected - probe).max()) < 2e-3:  # the profile is sRGB
@@ -208,7 +208,7 @@ def convert_profile(
     most = np.where((probe > 0.0) & (probe < 1.0), _INNER, _ENDS)
     if back is None or not np.allclose(back, probe, atol=most):  # a NaN is not close either
         return codes, srgb, None, broken
-    converted = _profile_to_srgb(srgb, icc)
+    converted = profile_to_srgb(srgb, icc)
     if converted is None or not np.isfinite(converted).all():
         return codes, srgb, None, broken
     outside = int(((converted < -1e-3) | (converted > 1.0 + 1e-3)).any(axis=-1).sum())
@@ -311,7 +311,7 @@ def _convert_lut_profile(
     )
 
 
-def _profile_to_srgb(encoded: FloatArray, icc: bytes) -> FloatArray | None:
+def profile_to_srgb(encoded: FloatArray, icc: bytes) -> FloatArray | None:
     """Decode matrix profiles, shape [H, W, 3]; None when OpenColorIO cannot use the profile.
 
     Values outside [0, 1] are colours outside sRGB.

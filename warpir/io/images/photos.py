@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpir.core import color
-from warpir.core.arrays import Float64Array, FloatArray, PixelArray, by_pixel
+from warpir.core.arrays import Float64Array, FloatArray, PixelArray, by_pixel, mask_box
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS
 from warpir.io.images.color_profile import (
@@ -22,12 +22,14 @@ from warpir.io.images.color_profile import (
     convert_profile,
     grey_profile,
     png_profile,
+    profile_to_srgb,
     srgb_to_profile,
 )
 from warpir.io.images.decoder import DecodedImage, decode_image, upright
 from warpir.io.images.envmap_conventions import to_ours
 from warpir.io.images.jpeg import JpegCoding, read_coding
 
+BOTH_WAYS = "read_photo keeps only profiles that work both ways"
 RADIANCE_LIMIT = 1e12
 """Of a panorama, relative [W/(m^2 sr)]; float32 products overflow from 10^19 on."""
 
@@ -106,12 +108,16 @@ class Photo:
         linear: FloatArray = color.gamma_to_linear(self.srgb[where])
         return linear
 
-    def encode(self, srgb: FloatArray, changed: NDArray[np.bool_]) -> PixelArray:
+    def encode(
+        self, srgb: FloatArray, changed: NDArray[np.bool_], kept: FloatArray | None = None
+    ) -> PixelArray:
         """Turn an edited image into codes that can be saved in place of the photograph.
 
         Args:
             srgb: The edited image, display-encoded Rec.709, shape [H, W, 3].
             changed: Where it was edited, shape [H, W]; all other pixels keep their codes.
+            kept: Share of the photograph's own light that is left [1], shape [H, W, 3]: it keeps
+                as much of its colours beyond sRGB. Absent: nothing.
 
         Returns:
             Integer codes in the photograph's own type and profile, shape [H, W, 3]; 16-bit
@@ -121,15 +127,20 @@ class Photo:
             # Not the photo's own encoding come back, so what the file states: sRGB.
             linear = color.gamma_to_linear(np.clip(srgb, 0.0, 1.0).astype(np.float64))
             return np.round(color.linear_to_srgb(linear) * 65535.0).astype(np.uint16)
-        own = srgb
-        if self.icc is not None:
-            in_profile = srgb_to_profile(srgb, self.icc)
-            assert in_profile is not None, "read_photo keeps only profiles that work both ways"
+        top, box = np.iinfo(self.codes.dtype).max, mask_box(changed)
+        own = srgb[box]
+        if self.icc is not None and changed.any():
+            if kept is not None:
+                given = self.codes[box].astype(np.float32) / np.float32(top)
+                whole = profile_to_srgb(given, self.icc)
+                assert whole is not None, BOTH_WAYS
+                own = own + (whole - self.srgb[box]) * by_pixel(color.linear_to_gamma, kept[box])
+            in_profile = srgb_to_profile(own, self.icc)
+            assert in_profile is not None, BOTH_WAYS
             own = in_profile
-        top = np.iinfo(self.codes.dtype).max
         codes = self.codes.copy()
-        edited = np.clip(own[changed].astype(np.float64), 0.0, 1.0)
-        codes[changed] = np.round(edited * top).astype(codes.dtype)
+        edited = np.clip(own[changed[box]].astype(np.float64), 0.0, 1.0)
+        codes[box][changed[box]] = np.round(edited * top).astype(codes.dtype)
         return codes
 
 
