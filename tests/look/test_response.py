@@ -89,6 +89,13 @@ def test_no_dark_regions_tell_nothing(low: float, high: float) -> None:
     assert look.response is None and look.record().keys() == {"blur", "grain"}
 
 
+def test_values_above_white_stay() -> None:
+    """Those of a linear plate, which a value of the flag is applied to."""
+    shown = np.array([0.1, 1.0, 1.5, 20.0], np.float32)
+    bent = Response(1.2).colour(shown)
+    assert bent[0] < 0.1 and bent[1:].tolist() == [1.0, 1.5, 20.0]
+
+
 def test_a_steeper_camera_gives_darker_blacks() -> None:
     """The same scene through three cameras; black and the steepest pictures stay in range."""
     rng = np.random.default_rng(3)

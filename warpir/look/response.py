@@ -93,8 +93,9 @@ class Response:
         return np.where(is_shown, shaded / p, ratio).astype(np.float32)
 
     def colour(self, shown: AnyFloatArray) -> FloatArray:
-        """Return the object's display-linear values behind the response, any shape."""
-        return self.knots().evaluate(np.asarray(shown, np.float64))[..., 0].astype(np.float32)
+        """Return display-linear values behind the response, any shape; those above 1 stay."""
+        bent = self.knots().evaluate(np.asarray(shown, np.float64))[..., 0]
+        return np.where(shown > 1.0, shown, bent).astype(np.float32)
 
 
 def statistics(linear: AnyFloatArray) -> Float64Array:

@@ -10,6 +10,7 @@ from tests import oracles as o
 from tests.builders.shapes import all_pixels, camera, constant, ground, placed, sphere, view_rays
 from tests.render.test_picture import QUALITY, bent, picture
 from warpir.core.arrays import Float64Array, FloatArray
+from warpir.look.response import Response
 from warpir.render.composite import UNCHANGED
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
@@ -177,3 +178,7 @@ def test_image_on_a_linear_plate_does_not_end_at_white() -> None:
     curves = replace(Curves.identity("linear"), is_clipped=False)
     added, _ = shown_mirror(planes, plate, curves, UNCHANGED)
     np.testing.assert_allclose(added, planes["image"], rtol=1e-5)
+    response = Response(1.2)
+    added, _ = shown_mirror(planes, plate, curves, replace(UNCHANGED, response=response))
+    dark = response.knots().invert(0.5)  # the ground's light; above 1 nothing is bent
+    np.testing.assert_allclose(added[0, :, 0], [0.5, 9.0 + dark - 0.5], rtol=1e-5)

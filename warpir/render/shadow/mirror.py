@@ -141,11 +141,15 @@ def shown_mirror(
     response = None if look.response is None else look.response.knots()
 
     def radiance(shown: Float64Array) -> Float64Array:
-        return curves.radiance(shown if response is None else response.invert(shown))
+        if response is not None:
+            shown = np.where(shown > 1.0, shown, response.invert(shown))
+        return curves.radiance(shown)
 
     def shown(radiance: Float64Array) -> Float64Array:
         values = curves.shown(radiance)
-        return values if response is None else response.evaluate(values)[..., 0]
+        if response is None:
+            return values
+        return np.where(values > 1.0, values, response.evaluate(values)[..., 0])
 
     before = radiance(photo)
     # All channels by the same factor, so that what is left keeps its hue.
