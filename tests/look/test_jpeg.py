@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.builders.image_files import table_profile
+from warpir.core.color import REC709_CHROMATICITIES, primaries_to_xyz
+from warpir.io.images.color_profile import D50
 from warpir.io.images.decoder import upright
 from warpir.io.images.jpeg import JpegCoding, read_coding
 from warpir.io.images.photos import read_photo
@@ -62,6 +65,10 @@ def test_grey_files_have_a_coding_and_others_none(rng: np.random.Generator, tmp_
     assert read_coding(tmp_path / "cmyk.jpg", 1) is None
     Image.fromarray(codes).save(tmp_path / "photo.png")
     assert read_photo(tmp_path / "photo.png").jpeg is None
+    tables = table_profile(primaries_to_xyz(REC709_CHROMATICITIES, D50))
+    Image.fromarray(codes).save(tmp_path / "tables.jpg", icc_profile=tables)
+    converted = read_photo(tmp_path / "tables.jpg")
+    assert converted.jpeg is None and any("in 8 bits" in notice for notice in converted.notices)
 
 
 def test_max_pixels_alone_limits_the_picture(

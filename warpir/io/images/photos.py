@@ -182,7 +182,7 @@ def read_photo(
             advice = "flatten it, or pass --alpha ignore"
             raise InputError(path, what, advice, reason="photo.transparent")
         notices.append("alpha channel ignored")
-    codes = _upright_rgb(image)
+    codes = stored = _upright_rgb(image)
     if image.is_grey:
         notices.append("grey image expanded to three channels")
     if bool((codes == codes[0, 0]).all()):
@@ -203,6 +203,7 @@ def read_photo(
         srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
     else:
         codes, srgb, icc = _to_srgb(path, codes, image, notices)
+    is_coded = image.kind == "jpeg" and icc is None and codes is stored
     return Photo(
         np.ascontiguousarray(codes),
         np.ascontiguousarray(srgb),
@@ -210,7 +211,7 @@ def read_photo(
         icc,
         image.focal_35mm,
         tuple(notices),
-        read_coding(path, image.orientation) if image.kind == "jpeg" and icc is None else None,
+        read_coding(path, image.orientation) if is_coded else None,
     )
 
 
