@@ -9,6 +9,7 @@ from warpir.core.arrays import Float64Array
 from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.look.camera_look import estimate_look
 from warpir.look.grain import Grain, as_told, estimate_grain, grain_over
+from warpir.look.texture import Texture
 
 
 def clean(height: int = 300, width: int = 400) -> Float64Array:
@@ -67,9 +68,22 @@ def test_texture_decides_the_strength() -> None:
     )
     told = as_told(posterised, 0.02 * flat.luminance_share)
     assert told is not None and np.max(told.strength) == pytest.approx(0.02)
-    alone = as_told(None, 0.012)
-    assert alone is not None and alone.of_luminance == pytest.approx(0.012)
+    for is_grey in (False, True):
+        alone = as_told(None, 0.012, is_grey)
+        assert alone is not None and alone.of_luminance == pytest.approx(0.012)
+        assert alone.correlation == is_grey
     assert as_told(flat, 0.0005) is None
+
+
+def test_grey_photo_without_flat_patches_has_the_told_grain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In a channel as much as in the luminance, since all are drawn alike."""
+    texture = Texture(0.0, 2.0 / 255.0)
+    monkeypatch.setattr("warpir.look.camera_look.read_texture", lambda *_: texture)
+    photo = np.zeros((90, 90, 3), np.float32)
+    grain = estimate_look(photo, photo, None, "off").grain
+    assert grain is not None and 255.0 * grain.typical == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("codes", [16.0, 24.0])

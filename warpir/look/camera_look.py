@@ -221,7 +221,8 @@ def estimate_look(
             blur = pool.submit(estimate_blur, linear, region, texture.result)
         if grain == "auto":
             flat, told = estimate_grain(srgb), texture.result().grain
-            look = replace(look, grain=flat if told is None else as_told(flat, told))
+            is_grey = bool((srgb == srgb[..., :1]).all())
+            look = replace(look, grain=flat if told is None else as_told(flat, told, is_grey))
     if sharpness == "auto":
         look = replace(look, blur=blur.result())
     elif sharpness != "off":

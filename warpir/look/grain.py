@@ -175,19 +175,20 @@ def _patches(srgb: AnyFloatArray) -> AnyFloatArray:
     return tiles.transpose(0, 2, 1, 3, 4).reshape(-1, SIDE, SIDE, 3)
 
 
-def as_told(grain: Grain | None, luminance: float) -> Grain | None:
+def as_told(grain: Grain | None, luminance: float, is_grey: bool = False) -> Grain | None:
     """Return a grain with the strength that the texture tells, or None below `LEAST`.
 
     Args:
         grain: That of flat patches, whose levels, channels and size are kept, its median level
             at the strength, but for one beyond `HEAVY`; None: without any.
         luminance: Standard deviation of the luminance [1].
+        is_grey: Whether the photo's channels are equal, and so is what is not known of its grain.
     """
     if luminance < LEAST:
         return None
     if grain and luminance > HEAVY[0] and grain.of_luminance > HEAVY[1]:
         return grain
-    found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, 0.0)
+    found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, float(is_grey))
     # Not that in the middle of the range, where a posterised picture may have none.
     median = float(np.median(np.mean(found.strength, axis=1)))
     times = luminance / (median * found.luminance_share)
