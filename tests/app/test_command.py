@@ -364,6 +364,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--up", "z"], "--up", "--camera"),
         (["--photo"], "--photo", "expected one argument"),
         (["--overwrite=yes"], "--overwrite", "ignored explicit argument"),
+        (["--lamp", "0,1,-1,0.1,5", "--lamp", "1,1,-1,0.1,5"], "--lamp", "given twice"),
         (["stray"], "stray", "no such flag"),
         (["--sample", "4"], "--sample", "no such flag"),
     ],

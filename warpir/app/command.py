@@ -202,6 +202,17 @@ class Parser(argparse.ArgumentParser):
         return super().format_help()
 
 
+class _OneLamp(argparse.Action):
+    """Keep the text of --lamp; of several the last one would count, without a word."""
+
+    def __call__(
+        self, _: argparse.ArgumentParser, given: argparse.Namespace, text: Any, *rest: Any
+    ) -> None:
+        if hasattr(given, self.dest):
+            raise argparse.ArgumentError(self, "given twice: --lamps FILE lists several lamps")
+        setattr(given, self.dest, text)
+
+
 class _HelpAll(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
         assert isinstance(parser, Parser)
@@ -252,7 +263,8 @@ def make_parser(
                     flag(name), dest=name, nargs="?", const=True, metavar=form.strip("[]")
                 )
             elif form:
-                group.add_argument(flag(name), dest=name, metavar=form)
+                keep = _OneLamp if name == "lamp" else "store"
+                group.add_argument(flag(name), dest=name, metavar=form, action=keep)
             else:
                 action = "store_false" if DEFAULTS[name] else "store_true"
                 group.add_argument(flag(name), dest=name, action=action)
