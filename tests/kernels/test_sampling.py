@@ -1,5 +1,7 @@
 """Frames, samplers and densities: chi-square against the papers, unbiased MIS."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import warp as wp
@@ -15,7 +17,7 @@ from warpir.kernels.sampling import (
     power_heuristic,
 )
 from warpir.kernels.types import LightArgs
-from warpir.render.device_light import light_args
+from warpir.render.device_light import PlaneLight, light_args
 from warpir.scene.light import Light, Lobes, fibonacci
 
 SAMPLE_COUNT = 200_000
@@ -297,6 +299,21 @@ def test_light_sample_of_a_mixture(device: str, rng: np.random.Generator) -> Non
         order=24,
     )
     assert verdict.passed, verdict
+
+
+def test_a_large_map_is_proposed_in_little_memory() -> None:
+    """Its tables are float32, 12 bytes a texel; what lies between is float64, for a band of it."""
+    texels = np.ones((1024, 2048, 3), np.float32)
+    tracemalloc.start()
+    try:
+        light = light_args(Light(texels=texels), wp.get_device("cpu"))
+        tracemalloc.reset_peak()
+        before = tracemalloc.get_traced_memory()[0]
+        PlaneLight(np.array([0.0, 1.0, 0.0])).of(light)
+        peak = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    assert peak < 24 * texels[..., 0].size, "bytes a texel: 81 with tables in float64"
 
 
 def on_half_texels(order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

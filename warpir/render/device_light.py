@@ -8,15 +8,15 @@ sun 1e-4 with `SIDE`, of 32 lobes 1e-3, and a third of either with `FINE_SIDE`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
-from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
+from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray, in_bands
 from warpir.core.color import luminance
 from warpir.core.errors import ExitCode, InputError
-from warpir.core.latlong import map_directions, texel_solid_angles
+from warpir.core.latlong import directions_at, latitudes, longitudes, texel_solid_angles
 from warpir.kernels.sampling import draw_light, sum_plane
 from warpir.kernels.types import DrawnLight, LampArgs, LightArgs
 from warpir.render.device import Launcher, Rows, copied
@@ -69,34 +69,21 @@ def propose(args: LightArgs, normal: Float64Array | None = None) -> None:
         if normal is not None:
             flux *= np.maximum(lobes.axis @ normal, LEAST_COSINE)
     height, width = args.map_height, args.map_width
-    weight = np.zeros((2, 1, 1))
+    part = np.zeros(2)
     if height:
-        shining = luminance(args.texels.numpy().astype(np.float64))
-        # What became NaN on the device is found when it is looked up, not by where it is drawn.
-        shining[~np.isfinite(shining)] = 0.0
-        sr = texel_solid_angles(height, width)[:, None]
-        is_bright = shining > BRIGHT * float((shining * sr).sum()) / (4.0 * np.pi)
-        shining *= sr
-        if normal is not None:
-            # A texel's light reaches one texel further.
-            reach = np.sin(1.5 * np.pi / height)
-            shining *= np.maximum(map_directions(height, width) @ normal + reach, 0.0)
-        weight = np.stack([np.where(is_bright, 0.0, shining), np.where(is_bright, shining, 0.0)])
-    part = weight.sum(axis=(1, 2))
+        row, columns = _cumulated(_weights_of(args.texels.numpy(), normal), height, width)
+        part = row.sum(axis=1)
     prob = _stratified(np.concatenate([part, flux]))
     if height and not args.lobe_count and part.sum() <= 0.0:
         # A black map is looked at evenly.
-        weight = np.stack([np.broadcast_to(sr, (height, width)), np.zeros((height, width))])
-        part, prob = weight.sum(axis=(1, 2)), np.array([1.0, 0.0])
+        sr = np.zeros((2, height, 1))
+        sr[0, :, 0] = texel_solid_angles(height, width)
+        row, columns = _cumulated(lambda rows: sr[:, rows].repeat(width, axis=2), height, width)
+        prob = np.array([1.0, 0.0])
     args.bright_prob, args.map_prob = float(prob[1]), float(prob[:2].sum())
     if height:
-        tables = [_cumulated(w) for w in weight]
-        rows, columns = (np.stack([t[k] for t in tables]) for k in range(2))
-        # From the float32 tables that the sampler searches, so that both agree exactly.
-        texel_prob = np.diff(rows.astype(np.float64))[:, :, None] * np.diff(
-            columns.astype(np.float64)
-        )
-        texel_prob = (texel_prob * prob[:2, None, None]).sum(axis=0)
+        rows = np.stack([_row_table(sums) for sums in row])
+        texel_prob = _texel_prob(rows, columns, prob)
         args.texel_prob = wp.array(texel_prob, dtype=float, device=device)
         args.row_cdf = wp.array(rows, dtype=float, device=device)
         args.column_cdf = wp.array(columns.reshape(2 * height, -1), dtype=float, device=device)
@@ -252,20 +239,86 @@ def _upload_map(args: LightArgs, texels: FloatArray | None, device: wp.Device) -
     args.texels = wp.array(np.ascontiguousarray(texels), dtype=wp.vec3, device=device)
 
 
-def _cumulated(weight: Float64Array) -> tuple[FloatArray, FloatArray]:
-    """Return the cumulated probabilities of rows [He + 1] and within each row [He, We + 1]."""
-    row = weight.sum(axis=1)
-    row_cdf = np.concatenate([[0.0], np.cumsum(row) / max(row.sum(), 1e-300)])
-    column = np.where(row[:, None] > 0.0, weight, 1.0)
-    column_cdf = np.concatenate(
-        [np.zeros((len(row), 1)), np.cumsum(column, axis=1) / column.sum(axis=1, keepdims=True)],
-        axis=1,
-    )
-    row_cdf = np.minimum(row_cdf, 1.0).astype(np.float32)
-    column_cdf = np.minimum(column_cdf, 1.0).astype(np.float32)
-    row_cdf[-1] = 1.0
-    column_cdf[:, -1] = 1.0
-    return row_cdf, column_cdf
+def _weights_of(texels: FloatArray, normal: Float64Array | None) -> Callable[[slice], Float64Array]:
+    """Return what weighs the texels of some rows, the bright ones apart, shape [2, row, We].
+
+    The arguments are as of `propose`.
+    """
+    height, width = texels.shape[:2]
+    sr = texel_solid_angles(height, width)[:, None]
+    flux = np.empty(height)
+
+    def shining(rows: slice) -> AnyFloatArray:
+        values = luminance(texels[rows].astype(np.float64))
+        # What became NaN on the device is found when it is looked up, not by where it is drawn.
+        values[~np.isfinite(values)] = 0.0
+        return values
+
+    def add(rows: slice) -> None:
+        flux[rows] = (shining(rows) * sr[rows]).sum(axis=1)
+
+    in_bands(add, height, width)
+    bright = BRIGHT * float(flux.sum()) / (4.0 * np.pi)
+
+    def weights(rows: slice) -> Float64Array:
+        values = shining(rows)
+        is_bright = values > bright
+        values *= sr[rows]
+        if normal is not None:
+            # A texel's light reaches one texel further.
+            reach = np.sin(1.5 * np.pi / height)
+            directions = directions_at(latitudes(height)[rows], longitudes(width))
+            values *= np.maximum(directions @ normal + reach, 0.0)
+        return np.stack([np.where(is_bright, 0.0, values), np.where(is_bright, values, 0.0)])
+
+    return weights
+
+
+def _cumulated(
+    weights: Callable[[slice], Float64Array], height: int, width: int
+) -> tuple[Float64Array, FloatArray]:
+    """Return the rows' sums [2, He] and the cumulated probabilities within each [2, He, We + 1].
+
+    In bands, as in float64 the tables of a map of thousands of rows would take gigabytes.
+    """
+    sums = np.empty((2, height))
+    columns = np.zeros((2, height, width + 1), np.float32)
+
+    def fill(rows: slice) -> None:
+        weight = weights(rows)
+        sums[:, rows] = row = weight.sum(axis=2)
+        column = np.where(row[..., None] > 0.0, weight, 1.0)
+        share = np.cumsum(column, axis=2) / column.sum(axis=2, keepdims=True)
+        columns[:, rows, 1:] = np.minimum(share, 1.0)
+        columns[:, rows, -1] = 1.0
+
+    in_bands(fill, height, width)
+    return sums, columns
+
+
+def _row_table(row: Float64Array) -> FloatArray:
+    """Return the cumulated probabilities of rows by their sums, shape [He + 1]."""
+    cdf = np.concatenate([[0.0], np.cumsum(row) / max(row.sum(), 1e-300)])
+    table = np.minimum(cdf, 1.0).astype(np.float32)
+    table[-1] = 1.0
+    return table
+
+
+def _texel_prob(rows: FloatArray, columns: FloatArray, prob: Float64Array) -> FloatArray:
+    """Return the probability of each texel, shape [He, We].
+
+    From the float32 tables that the sampler searches, so that both agree exactly.
+    """
+    height, width = columns.shape[1], columns.shape[2] - 1
+    texel_prob = np.empty((height, width), np.float32)
+    of_row = np.diff(rows.astype(np.float64))[..., None]
+
+    def fill(band: slice) -> None:
+        within = of_row[:, band] * np.diff(columns[:, band].astype(np.float64))
+        texel_prob[band] = (within * prob[:2, None, None]).sum(axis=0)
+
+    in_bands(fill, height, width)
+    return texel_prob
 
 
 def _require_finite(values: AnyFloatArray, what: str) -> None:
