@@ -1,5 +1,6 @@
 """Environment maps in, on files made here; values are asserted exactly."""
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -263,6 +264,19 @@ def test_map_of_a_part_of_its_window(tmp_path: Path, rng: np.random.Generator) -
     expected = np.zeros((8, 16), np.float32)
     expected[3:7, :4] = plane[:, 2:]
     np.testing.assert_array_equal(read_envmap(tmp_path / "m.exr")[..., 0], expected)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_a_map_is_read_without_copies(tmp_path: Path, suffix: str) -> None:
+    path = write_image(tmp_path / f"map{suffix}", np.full((512, 1024, 3), 0.5, np.float32))
+    read_envmap(path)  # loads the libraries
+    tracemalloc.start()
+    try:
+        size = read_envmap(path).nbytes
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.0 * size
 
 
 @needs_shared

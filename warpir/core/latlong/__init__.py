@@ -120,7 +120,7 @@ def interpolate(texels: FloatArray, column: Float64Array, row: Float64Array) -> 
 def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
     """Turn a map about +Y, counter-clockwise seen from above; each row keeps its sum.
 
-    Whole columns are moved exactly.
+    Whole columns are moved exactly; what stays as it is may be the array itself.
 
     The map's u falls with longitude (``lon = pi (1 - 2u)``), so content moves to smaller columns.
     """
@@ -129,7 +129,8 @@ def rotate_map(texels: FloatArray, degrees: float) -> FloatArray:
         columns = round(columns)
     whole = int(np.floor(columns))
     part = np.float32(columns - whole)
-    moved = np.roll(texels, whole, axis=1)
+    is_turned = whole % texels.shape[1] != 0
+    moved = np.roll(texels, whole, axis=1) if is_turned else texels
     if part > 0.0:
         moved = (np.float32(1.0) - part) * moved + part * np.roll(texels, whole + 1, axis=1)
     return np.ascontiguousarray(moved, dtype=np.float32)

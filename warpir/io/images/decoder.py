@@ -130,7 +130,7 @@ def _as_the_file_means(
     if kind == "exr":
         return _place_in_display_window(pixels, spec)
     if kind == "hdr":
-        return np.asarray(pixels / np.float32(exposure(path, head)))
+        pixels /= np.float32(exposure(path, head))
     return pixels
 
 

@@ -291,7 +291,8 @@ def read_envmap(
     _repair_radiance(path, texels, strict, messages)
     # Colours outside Rec.709 are negative in it, and no light is.
     with np.errstate(over="ignore", invalid="ignore"):  # refused below
-        texels = np.maximum(_to_rec709(texels, image, messages), 0.0)
+        texels = _to_rec709(texels, image, messages)
+        np.maximum(texels, 0.0, out=texels)
     _check_brightness(path, texels, messages)
     if notices is not None:
         notices += messages
@@ -395,7 +396,7 @@ def _radiance(path: Path, codes: PixelArray, image: DecodedImage, notices: list[
     """Return the values of a panorama as radiance, not yet checked, shape [height, width, 3]."""
     if codes.dtype.kind == "f":
         with np.errstate(over="ignore"):  # `_repair_radiance` counts them
-            return np.array(codes, dtype=np.float32)
+            return np.asarray(codes, dtype=np.float32)
     srgb = _to_srgb(path, codes, image, notices)[1]
     notices.append(
         "a picture, not high dynamic range: decoded as sRGB; lamps and a sun in it are no "
