@@ -24,6 +24,7 @@ from warpir.core.atomic import write_folder
 from warpir.core.errors import ExitCode, InputError
 from warpir.io import results as files
 from warpir.io.images.photos import read_envmap, read_photo
+from warpir.io.images.writers import envmap_preview
 from warpir.io.layers import BACKGROUND_DEPTH, Layers, read_layers, write_layers
 from warpir.io.results import OutputFolder
 from warpir.scene.camera import Camera, camera_from_fov
@@ -304,6 +305,14 @@ def test_envmap_files(tmp_path: Path) -> None:
     with OutputFolder(tmp_path / "bad") as out, pytest.raises(InputError) as caught:
         out.write_envmap(-texels)
     assert caught.value.code == ExitCode.NUMERIC
+
+
+def test_the_preview_of_a_large_map_is_small() -> None:
+    texels = np.full((2048, 4096, 3), 0.5, np.float32)
+    texels[:1024] = 0.1
+    preview = envmap_preview(texels)
+    assert preview.shape == (1024, 2048, 3)
+    assert len(np.unique(preview[:512])) == len(np.unique(preview[512:])) == 1
 
 
 def small_layers(rng: np.random.Generator) -> tuple[Layers, Camera]:

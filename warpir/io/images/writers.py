@@ -17,11 +17,14 @@ import warpir
 from warpir.core import color
 from warpir.core.arrays import CodeArray, FloatArray, PixelArray, on_cores
 from warpir.core.errors import ExitCode, InputError, disk_error
+from warpir.core.latlong import resize_map
 from warpir.core.memory import core_count
 from warpir.io.images.decoder import decode_image, library_error
 
 BLOCK, WINDOW = 1 << 18, 1 << 15
 """Bytes that are deflated at once, and how far back deflate looks [byte]."""
+PREVIEW_ROWS = 1024
+"""Rows of an environment map's preview, at most."""
 _XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -160,8 +163,10 @@ def envmap_exr_bytes(where: Path, texels: FloatArray) -> bytes:
 def envmap_preview(texels: FloatArray) -> CodeArray:
     """Return an environment map as a person expects it: the viewing direction -Z in the middle.
 
-    Texels are those of `envmap_exr_bytes`, the result sRGB codes, scaled and clipped.
+    Texels are those of `envmap_exr_bytes`, the result sRGB codes of `PREVIEW_ROWS` rows at most,
+    scaled and clipped.
     """
+    texels = resize_map(texels, min(len(texels), PREVIEW_ROWS))
     seen = np.roll(texels.astype(np.float32), texels.shape[1] // 2, axis=1)
     white = float(np.percentile(color.luminance(seen), 95.0)) / 0.8
     shown = color.linear_to_srgb(np.clip(seen / np.float32(white or 1.0), 0.0, 1.0))
