@@ -11,11 +11,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.builders.image_files import write_image
 from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import STATE, command, enter, placing, press, save, settle
+from warpir.app.inputs import read_light
+from warpir.app.settings import LightConfig
 from warpir.core.errors import InputError
+from warpir.core.latlong import resize_map
+from warpir.core.limits import Limits
+from warpir.core.progress import Log
 from warpir.lighting.regression import CLEAR_DEG, Regression, regress
 from warpir.lighting.regressor import load_regressor
+from warpir.place import kept
 from warpir.place.work import light_record
 from warpir.place.worker import Worker
 from warpir.scene.camera import camera_from_fov
@@ -173,3 +180,26 @@ def test_page_draws_no_sun_at_night(inputs: Path, tmp_path: Path) -> None:
         settle(opened)
         assert page.is_checked("#keep-light") and page.evaluate(sun) is True
         assert page.locator("#dial .sun").is_visible()
+
+
+def test_a_large_panorama_is_read_once_and_shrunk(tmp_path: Path, monkeypatch) -> None:
+    texels = np.full((1024, 2048, 3), 0.25, np.float32)
+    texels[200:202, 500:504] = 900.0
+    path = write_image(tmp_path / "sky.exr", texels)
+    reads = []
+
+    def read(*asked):
+        reads.append(asked)
+        return read_light(*asked)
+
+    monkeypatch.setattr(kept, "read_light", read)
+    loaders, up = kept.Kept(), np.array([0.0, 1.0, 0.0])
+    for turn in (0.0, 90.0):
+        asked = LightConfig(file=str(path), rotate=turn)
+        light = loaders.light(asked, False, np.eye(4), Limits(), Log())
+        assert light is not None and light.texels is not None
+        assert light.texels.shape == (512, 1024, 3)
+        given = read_light(asked, False, np.eye(4), Limits(), Log())
+        np.testing.assert_allclose(light.irradiance(up), given.irradiance(up), rtol=1e-3)
+        np.testing.assert_array_equal(light.texels, resize_map(given.texels, 512))
+    assert len(reads) == 1

@@ -108,6 +108,7 @@ class Loaders:
         self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
+        self.light = read_light
 
 
 @dataclass(frozen=True)
@@ -205,11 +206,10 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     states: dict[str, tuple[Path, _State | None]] = {}
     with suppress(InputError):  # the reader tells
         states = {name: (path, _state(path)) for name, path in input_files(config).items()}
-    log, limits, inputs = Log(), config.limits, config.inputs
+    log, limits, inputs, given = Log(), config.limits, config.inputs, config.light
     for name, (path, state) in states.items():
         if state is not None and name in PICTURES:  # all of it is read for its sha256
-            what, size = "too large", state[1]
-            attempt(partial(limits.check, "file_bytes", size, path, what, more=" bytes"))
+            attempt(partial(limits.check, "file_bytes", state[1], path, "too large", more=" bytes"))
     photo = attempt(lambda: loaders.photo(inputs, limits))
     attempt(lambda: _check_width(config.render.width, photo, limits))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
@@ -218,7 +218,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     if asset is not None:
         problems += refused_refinement(config, asset)
     run = view = points = proxy = None
-    if (reuse := config.light.reuse) is not None:
+    if (reuse := given.reuse) is not None:
         run = attempt(lambda: loaders.run(reuse, limits))
     if photo is not None:
         name = Path(str(inputs.photo)).name
@@ -227,13 +227,12 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
         view = attempt(lambda: photo_camera(config.camera, photo, name, estimator, limits))
     # Without a camera the run ends below, but all that is wrong with the light is told too.
     pose = view.camera.c2w if view is not None else np.eye(4)
-    light = attempt(lambda: _read_light(config.light, inputs.strict, pose, limits, log))
+    light = attempt(lambda: loaders.light(given, inputs.strict, pose, limits, log))
     if (points_path := config.camera.ground_points) is not None:
         points = attempt(lambda: read_point_cloud(points_path, limits))
     if (proxy_path := config.camera.proxy) is not None:
         proxy = attempt(lambda: loaders.proxy(proxy_path, limits))
-    near = config.light.lamp, config.light.lamps
-    lamps = attempt(lambda: given_lamps(*near, limits, log.notice)) or ()
+    lamps = attempt(lambda: given_lamps(given.lamp, given.lamps, limits, log.notice)) or ()
     attempt(lambda: require_model(config))
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
@@ -471,9 +470,10 @@ def _read_mask(
     return mask
 
 
-def _read_light(
+def read_light(
     asked: LightConfig, strict: bool, camera_to_world: Float64Array, limits: Limits, log: Log
 ) -> Light | None:
+    """Return what --light holds, turned by --light-rotate; None where it is not given."""
     if asked.file is None:
         return None
     if Path(asked.file).suffix.lower() == ".json":

@@ -11,18 +11,24 @@ import numpy as np
 from PIL import Image
 
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import Inputs, Loaders, read_photo_of
-from warpir.app.settings import InputConfig
-from warpir.core.arrays import FloatArray
+from warpir.app.inputs import Inputs, Loaders, read_light, read_photo_of
+from warpir.app.settings import InputConfig, LightConfig
+from warpir.core.arrays import Float64Array, FloatArray
+from warpir.core.latlong import resize_map
 from warpir.core.limits import Limits
+from warpir.core.progress import Log
+from warpir.io.images.envmap_conventions import IN_CAMERA_AXES
 from warpir.io.images.photos import Photo
 from warpir.place.preview_asset import preview_asset
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
+from warpir.scene.light import Light
 
 if TYPE_CHECKING:
     from warpir.lighting.regression import Regression
 
+LIGHT_ROWS = 512
+"""Rows of a given panorama for a preview, at most."""
 LIGHTS = 4
 """Estimated lights that are kept: undo goes back to cameras of before."""
 
@@ -42,6 +48,8 @@ class Kept(Loaders):
         self._small: tuple[Photo, tuple[int, int], Photo] | None = None
         self._thin: tuple[InputConfig, Asset] | None = None
         self._light = lru_cache(maxsize=LIGHTS)(self._regression)
+        self._given: tuple[object, Light | None, list[str]] | None = None
+        self.light = self._small_light
 
     def shrunk(self, inputs: Inputs, width: int) -> Inputs:
         """Return the inputs with photo, camera and mask at most this wide [px]."""
@@ -73,6 +81,28 @@ class Kept(Loaders):
         pose = tuple(float(part) for part in np.round(camera.c2w, 9).ravel())
         key = _key(config.inputs, config.limits)
         return self._light(key, config.light.regressor, lens, pose)
+
+    def _small_light(
+        self,
+        asked: LightConfig,
+        strict: bool,
+        camera_to_world: Float64Array,
+        limits: Limits,
+        log: Log,
+    ) -> Light | None:
+        """Return what --light holds, a large panorama made smaller, read once for all its turns."""
+        asked, turn = replace(asked, rotate=0.0), asked.rotate
+        axes = camera_to_world.tobytes() if asked.convention in IN_CAMERA_AXES else b""
+        key = asked.file, asked.convention, asked.fit_lobes, strict, limits, axes
+        if self._given is None or self._given[0] != key:
+            about = Log()
+            light = read_light(asked, strict, camera_to_world, limits, about)
+            if light is not None and light.texels is not None:
+                rows = min(len(light.texels), LIGHT_ROWS)
+                light = Light(texels=resize_map(light.texels, rows))
+            self._given = key, light, about.notices
+        log.notice(*self._given[2])
+        return None if self._given[1] is None else self._given[1].rotated(turn)
 
     def _regression(
         self,

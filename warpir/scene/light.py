@@ -58,7 +58,7 @@ class Light:
             lobes = replace(lobes, amplitude=(lobes.amplitude * factor).astype(np.float32))
         texels = self.texels
         if texels is not None:
-            texels = (texels * np.float32(factor)).astype(np.float32)
+            texels = (texels * np.float32(factor)).astype(np.float32, copy=False)
         return Light(lobes, texels)
 
     def rotated(self, degrees: float) -> Light:
