@@ -6,6 +6,7 @@
 import io
 import json
 import struct
+import threading
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from warpir.core import arrays
 from warpir.io.assets import load_asset
+from warpir.io.gltf import writer
 from warpir.io.gltf.materials import HONOURED
 from warpir.io.gltf.writer import write_glb
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
@@ -332,6 +335,22 @@ def test_index_width_follows_the_vertex_count(count: int, component: int) -> Non
     written = document(write_glb(asset, IDENTITY))
     indices = written["accessors"][written["meshes"][0]["primitives"][0]["indices"]]
     assert indices["componentType"] == component
+
+
+def test_textures_are_compressed_side_by_side(monkeypatch) -> None:
+    both = threading.Barrier(2, timeout=20.0)
+
+    def png(pixels: np.ndarray) -> bytes:
+        both.wait()
+        return pixels.tobytes()
+
+    monkeypatch.setattr(arrays, "core_count", lambda: 2)
+    monkeypatch.setattr(writer, "png", png)
+    first, second = (np.full((1, 1, 4), k, np.uint8) for k in (1, 2))
+    corner = Primitive(np.eye(3), np.array([[0, 1, 2]], np.int32), 0)
+    textures = Texture(first), Texture(second), Texture(first)
+    glb = write_glb(Asset("tile", (corner,), (Material(),), textures), np.eye(4))
+    assert glb.index(first.tobytes()) < glb.index(second.tobytes())
 
 
 def test_absent_coordinates_of_a_texture_are_zero(tmp_path: Path) -> None:

@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 import warpir
-from warpir.core.arrays import CodeArray, Float64Array, FloatArray, PixelArray, affine_matrix
+from warpir.core.arrays import (
+    CodeArray,
+    Float64Array,
+    FloatArray,
+    PixelArray,
+    affine_matrix,
+    on_cores,
+)
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive, Texture, TextureSlot
 from warpir.scene.camera import Camera
@@ -329,21 +336,18 @@ def _texture_info(file: _Glb, slot: TextureSlot, name: str) -> Members:
 
 def _textures(file: _Glb, textures: tuple[Texture, ...]) -> Members:
     """Return images, samplers and textures; equal ones are written once."""
-    images: list[Members] = []
-    image_of: dict[int, int] = {}
+    pixels = {id(texture.pixels): texture.pixels for texture in textures}
+    views = [file.view(image) for image in on_cores(png, pixels.values())]
+    image_of = {key: k for k, key in enumerate(pixels)}
     samplers: dict[tuple[str, str], int] = {}
     entries: list[Members] = []
     for texture in textures:
-        if id(texture.pixels) not in image_of:
-            image_of[id(texture.pixels)] = len(images)
-            view = file.view(png(texture.pixels))
-            images.append({"bufferView": view, "mimeType": "image/png"})
         wraps = texture.wrap_u, texture.wrap_v
         sampler = samplers.setdefault(wraps, len(samplers))
         entries.append({"source": image_of[id(texture.pixels)], "sampler": sampler})
     filters = {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR}
     return {
-        "images": images,
+        "images": [{"bufferView": view, "mimeType": "image/png"} for view in views],
         "samplers": [filters | {"wrapS": WRAPS[u], "wrapT": WRAPS[v]} for u, v in samplers],
         "textures": entries,
     }
