@@ -202,7 +202,9 @@ def _stored_channels(
             expected = (height, width, len(names))
             raise ValueError(f"layer {name}: shape {plane.shape}, expected {expected}")
         is_float = name in _FULL_FLOATS or (is_deep and name in _DEEP)
-        if not is_float and not np.abs(plane).max(initial=0.0) < HALF_MAX:
+        # Of all values, without an array of their sizes.
+        largest = max(plane.max(initial=0.0), -plane.min(initial=0.0))
+        if not is_float and not largest < HALF_MAX:
             clamped += int((np.isfinite(plane) & (np.abs(plane) >= HALF_MAX)).sum())
             # NaN and Inf pass through, and the writer refuses them.
             plane = np.where(np.isfinite(plane), np.clip(plane, -HALF_MAX, HALF_MAX), plane)
