@@ -260,6 +260,7 @@ def test_only_a_light_that_is_given_is_turned(values: Any) -> None:
         (["--device", "cuda:1"], "device", "cuda:1"),
         (["--photo", "-x.png"], "photo", "-x.png"),
         (["--width", "8"], "width", 8),
+        (["--seed", str(2**32 - 1)], "seed", 2**32 - 1),
         (["--no-personalize"], "personalize", False),
         ([*PAINTER, "--accept"], "accept", True),
         (["--regressor", "own.safetensors"], "regressor", "own.safetensors"),
@@ -289,6 +290,8 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--samples", "1.5"], "--samples", "whole number"),
         pytest.param(["--fov", "1_0"], "--fov", "expected a number", id="F1-fov-1_0"),
         pytest.param(["--seed", "1_0"], "--seed", "expected a whole number", id="F1-seed-1_0"),
+        pytest.param(["--seed", "1.5"], "--seed", "whole number", id="F8-fraction"),
+        pytest.param(["--seed", str(2**32)], "--seed", "at most 4294967295", id="F8-2^32"),
         (["--fov", "180"], "--fov", "between 0 and 180 (found 180.0)"),
         (["--fov", "nan"], "--fov", "finite"),
         (["--fov", "1e400"], "--fov", "finite"),
@@ -316,7 +319,8 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--guidance", "stable-diffusion", "--prompt", "p"], "--model", "needed"),
         (["--guidance", "stable-diffusion", "--model", "m"], "--prompt", "needed"),
         ([*PAINTER, "--no-personalize"], "--no-personalize", "--loss lds"),
-        (["--prompt", "p\0"], "--prompt", "NUL"),
+        pytest.param(["--prompt", "p\0"], "--prompt", "NUL", id="F4-NUL"),
+        pytest.param(["--prompt", ""], "--prompt", "empty", id="F4-empty"),
         (["--prompt", "\u00e9" * 2049], "--prompt", "4098 bytes"),
         (["--prompt", " "], "--prompt", "empty (found ' '"),
         (["--prompt", "the."], "--prompt", "empty (found 'the.'"),
@@ -567,7 +571,19 @@ def test_large_pictures_have_fewer_samples(
     [
         ("c.yaml", "samples: .nan\n", "whole number"),
         ("c.yaml", "samples: true\n", "whole number"),
-        ("c.yaml", "samples: -3\n", "at least 1"),
+        pytest.param("c.yaml", "samples: -3\n", "at least 1", id="F1-negative-samples"),
+        pytest.param("c.yaml", "sampels: 3\n", "unknown key 'sampels'", id="F1-unknown-key"),
+        pytest.param("c.yaml", "samples: [3]\n", "whole number", id="F1-wrong-type"),
+        pytest.param("c.yaml", "fov: .nan\n", "finite", id="F1-nan"),
+        pytest.param("c.yaml", "fov: 1e400\n", "finite", id="F1-1e400-yaml"),
+        pytest.param("c.json", '{"fov": 1e400}', "line 1", id="F1-1e400-json"),
+        pytest.param(
+            "c.yaml",
+            "photo: !!python/object/apply:os.mkdir ['made']\n",
+            "not YAML",
+            id="F1-yaml-tag",
+        ),
+        pytest.param("c.json", '{"format": true, "config": {}}', "format", id="F2-no-version"),
         ("c.yaml", "depth: null\n", "whole number"),
         ("c.yaml", "seed: 1.5\n", "whole number"),
         ("c.yaml", "overwrite: 1\n", "true or false"),
@@ -934,19 +950,6 @@ def test_main_stops_on_sigterm(
     monkeypatch.setattr(warpir.insert, "insert", terminate)
     assert warpir.insert.main(scene) == 143
     assert signal.getsignal(signal.SIGTERM) == before
-
-
-@pytest.mark.case("R11")
-def test_main_survives_a_closed_stdout(scene: list[str], tmp_path: Path) -> None:
-    """``| head`` ends neither the run nor its status (R11)."""
-    code = (
-        "import os, sys\nread, write = os.pipe()\nos.close(read)\nos.dup2(write, 1)\n"
-        f"from warpir.insert import main\nsys.exit(main({[*scene, '--validate']!r}))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_line_is_written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.app.test_command import run
 from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.gltf_files import Builder
 from tests.builders.image_files import png_header
@@ -67,14 +65,6 @@ def validated(argv: list[str], cwd: Path, **same: Any) -> Ended:
 # ------------------------------------------------------------------------------------- order
 
 
-def test_validate_of_the_demo_is_torch_free_in_a_process_of_its_own(tmp_path: Path) -> None:
-    """The program as a user starts it: seconds, no torch, no Warp, nothing left behind."""
-    done = run(["--demo", "--out", "out", "--validate"], tmp_path, TELL)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-2:] == ["inputs are valid", "loaded []"]
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("case", ["light-given", "regressor", "panorama-to-fit"])
 def test_validate_asks_for_models_without_torch(case: str, inputs: Path, tmp_path: Path) -> None:
     demo = ["--demo", "--out", "out"]
@@ -84,31 +74,6 @@ def test_validate_asks_for_models_without_torch(case: str, inputs: Path, tmp_pat
         "panorama-to-fit": arguments(inputs, "out", fit_lobes="4"),
     }[case]
     assert validated(argv, tmp_path, before=TELL).out.splitlines()[-1] == "loaded []"
-
-
-@pytest.mark.slow
-def test_validate_reads_model_and_lora_without_torch(tmp_path: Path) -> None:
-    """A folder in diffusers' layout and a LoRA are told by their headers."""
-    import torch
-    from safetensors.torch import save_file
-
-    from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-
-    model = make_tiny_stable_diffusion(tmp_path / "model")
-    argv = ["--demo", "--out", "out", "--model", str(model), "--prompt", "a car"]
-    layer = "unet.down_blocks.0.attentions.0.transformer_blocks.0.attn2.to_k"
-    for width, rank, words in ((32, 2, None), (768, 2, "cross-attention 768"), (32, 0, "rank 0")):
-        lora = tmp_path / f"lora_{width}_{rank}.safetensors"
-        down, up = torch.zeros(rank, width), torch.zeros(32, rank)
-        named = {f"{layer}.lora.down.weight": down, f"{layer}.lora.up.weight": up}
-        save_file({key: part.contiguous() for key, part in named.items()}, lora)
-        case = [*argv, "--lora", str(lora)]
-        if words is None:
-            assert validated(case, tmp_path, before=TELL).out.endswith("loaded []\n")
-        else:
-            assert_fails([*case, "--validate"], ExitCode.MODEL, lora.name, words, cwd=tmp_path)
-    (model / "vae" / "diffusion_pytorch_model.safetensors").unlink()
-    assert_fails([*argv, "--validate"], ExitCode.MODEL, "missing vae", cwd=tmp_path)
 
 
 def weights(change: Callable[[bytearray], None], name: str) -> Callable[[Path], list[str]]:
@@ -129,36 +94,14 @@ def cut(content: bytearray) -> None:
     del content[len(content) // 2 :]
 
 
-def flip(content: bytearray) -> None:
-    content[-7] ^= 1
-
-
-def huge_header(content: bytearray) -> None:
-    content[:8] = (2**62).to_bytes(8, "little")
-
-
-def not_finite(content: bytearray) -> None:
-    content[-4:] = b"\xff" * 4  # NaN in halves and in floats
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (weights(cut, "regressor"), "cut or damaged"),
-        (weights(flip, "regressor"), "not those that were written"),
-        (weights(huge_header, "regressor"), "cut or damaged"),
-        (weights(not_finite, "regressor"), "not finite"),
         (lambda folder: ["--regressor", "none.safetensors"], "no such file"),
         (lambda folder: ["--model", "nowhere", "--prompt", "car"], "no such folder"),
     ],
-    ids=[
-        "L2-cut-regressor",
-        "L2-flipped-regressor",
-        "L2-header-2^62",
-        "L2-nan-regressor",
-        "missing-regressor",
-        "L1-missing-model",
-    ],
+    ids=["L2-cut-regressor", "missing-regressor", "L1-missing-model"],
 )
 @pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
 def test_models_are_looked_at_before_torch_is_loaded(
@@ -304,6 +247,14 @@ def sparse_file(name: str, flag: str, size: int, **more: str | None) -> Make:
     return written(name, flag, lambda path: sparse(path, size), **more)
 
 
+def json_of_glb(path: Path) -> None:
+    """A GLB whose JSON takes as much, and holds nothing."""
+    size = 1 << 28
+    sparse(path, size)
+    with path.open("r+b") as stream:
+        stream.write(struct.pack("<4sIII4s", b"glTF", 2, size, size - 20, b"JSON"))
+
+
 def glb_file(plant: Callable[[Builder], None], flag: str = "asset", **more: str | None) -> Make:
     """A GLB that is correct but for its size."""
 
@@ -400,6 +351,7 @@ TOO_MUCH: dict[str, tuple[int, str, Make]] = {
     "M2-proxy-of-3-GiB": (3, "file_bytes", sparse_file("a.ply", "proxy", 3 << 30)),
     "M2-buffer-of-2-GiB": (3, "file_bytes", buffer_beside),
     "M2-gltf-JSON-of-1-GiB": (3, "gltf_json_bytes", sparse_file("a.gltf", "asset", 1 << 30)),
+    "M2-JSON-of-256-MiB-in-glb": (3, "gltf_json_bytes", written("a.glb", "asset", json_of_glb)),
     "M2-nested": (3, "nesting", named("a.gltf", "[" * 100_000, "asset")),
     "M14-50-million-triangles": (3, "triangles", glb_file(many_triangles)),
     "M14-64-textures-of-8k": (3, "texture_pixels", glb_file(textures(64, 8192))),
@@ -521,37 +473,7 @@ def test_yaml_at_its_limit_is_read_in_time(tmp_path: Path) -> None:
     assert_fails(["--config", "c.yaml"], ExitCode.USAGE, "--place", cwd=tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.case("I5")
-def test_photo_of_100_megapixels(inputs: Path, tmp_path: Path) -> None:
-    """Refused by its header; with another limit read, in memory that goes with its size."""
-    Image.new("RGB", (10_000, 10_000), (90, 120, 60)).save(tmp_path / "p.png", compress_level=1)
-    argv = arguments(inputs, "out", photo="p.png")
-    assert_fails([*argv, "--validate"], ExitCode.INPUT, "10000 x 10000", cwd=tmp_path)
-    ended = run_case([*argv, "--validate", "--max-pixels", "100000000"], tmp_path)
-    assert ended.status == 0, ended
-    # The photo is 3 bytes of codes and 12 of floats a pixel.
-    assert ended.peak_bytes < 100e6 * 15 + 500e6
-
-
 # ------------------------------------------------------------------ what works although it is odd
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["Grüße 写真.png", "a 'b' \"c\".png", "n" * 251 + ".png", "-x.png", "--out.png", "a\nb.png"],
-    ids=["I17-letters", "I17-quotes", "I17-255-bytes", "I17-minus", "I17-two-minus", "I17-newline"],
-)
-def test_names_of_files(name: str, inputs: Path, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes((inputs / "photo.png").read_bytes())
-    argv = arguments(inputs, "out", photo=None)
-    validated([*argv, f"--photo={name}"], tmp_path)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (7, 5), (3, 4000)], ids="I14-{0[0]}x{0[1]}".format)
-def test_odd_photos_are_valid(size: tuple[int, int], inputs: Path, tmp_path: Path) -> None:
-    Image.new("RGB", size, (120, 130, 140)).save(tmp_path / "odd.png")
-    validated(arguments(inputs, "out", photo="odd.png"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -603,99 +525,28 @@ def test_unreadable_photo(inputs: Path, tmp_path: Path) -> None:
     assert before is None or snapshot(tmp_path) == before
 
 
-@pytest.mark.case("M10")
-def test_deep_scene_is_valid(inputs: Path, tmp_path: Path) -> None:
-    """A chain of 3000 nodes is no recursion."""
-    builder = Builder()
-    builder.json["nodes"] = [*({"children": [k + 1]} for k in range(2999)), {"mesh": 0}]
-    (tmp_path / "deep.glb").write_bytes(builder.glb())
-    validated(arguments(inputs, "out", asset="deep.glb"), tmp_path)
-
-
-@pytest.mark.case("C9")
-def test_camera_with_a_byte_order_mark(inputs: Path, tmp_path: Path) -> None:
-    (tmp_path / "c.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(CAMERA).encode())
-    validated(arguments(inputs, "out", camera="c.json", **NO_POSE), tmp_path)
-
-
 # -------------------------------------------------------------------- configuration and prompt
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("c.yaml", "sampels: 3\n", "unknown key 'sampels'"),
-        ("c.yaml", "samples: [3]\n", "--samples"),
-        ("c.yaml", "steps: -3\n", "--steps"),
-        ("c.yaml", "fov: .nan\n", "--fov"),
-        ("c.yaml", "fov: 1e400\n", "--fov"),
-        ("c.json", '{"fov": 1e400}', "line 1"),
-        ("c.yaml", "photo: !!python/object/apply:os.mkdir ['made']\n", "not YAML"),
-        ("c.yaml", "a: &a [x]\nplace: [*a, *a, *a]\n", "unknown key 'a'"),
-        ("c.json", '{"format": 99, "config": {}}', "format"),
-        ("c.json", '{"format": true, "config": {}}', "format"),
-        ("none.yaml", None, "none.yaml"),
-    ],
-    ids=[
-        "F1-unknown-key", "F1-wrong-type", "F1-negative-steps", "F1-nan", "F1-1e400-yaml",
-        "F1-1e400-json", "F1-yaml-tag", "F1-aliases", "F2-newer-version", "F2-no-version",
-        "F1-missing",
-    ],
-)  # fmt: skip
-def test_configurations_are_refused(
-    name: str, text: str | None, words: str, inputs: Path, tmp_path: Path
-) -> None:
-    if text is not None:
-        (tmp_path / name).write_text(text)
-    argv = arguments(inputs, "out", config=name, fov=None, samples=None)
-    assert_fails(argv, ExitCode.USAGE, words, cwd=tmp_path)
-
-
-@pytest.mark.case("F2", "F3")
-def test_configuration_of_an_older_run_yields_to_flags(inputs: Path, tmp_path: Path) -> None:
-    """A run.json of fewer keys means the defaults of the others; what a flag says is logged."""
-    (tmp_path / "run.json").write_text(json.dumps({"format": 1, "config": {"samples": 7}}))
-    ended = validated([*arguments(inputs, "out", config="run.json")], tmp_path)
-    assert "--samples given at the command line replaces the value in run.json" in ended.out
-
-
 PROMPTS = {
-    "F4-empty": ("", 2),
-    "F4-NUL": ("a car\0", 2),
-    "F4-emoji": ("a car \U0001f697", 0),
-    "F4-newlines": ("a car,\n\nred\n", 0),
-    "F4-shell": ("$(touch made); `touch made` | touch made ../made", 0),
-    "F4-path": ("../../made/car", 0),
-    "F4-4096-bytes": ("car " * 1024, 0),
+    "F4-emoji": "a car \U0001f697",
+    "F4-newlines": "a car,\n\nred\n",
+    "F4-shell": "$(touch made); `touch made` | touch made ../made",
+    "F4-path": "../../made/car",
+    "F4-4096-bytes": "car " * 1024,
 }
 
 
 @pytest.mark.parametrize("case", PROMPTS)
 def test_prompts(case: str, inputs: Path, tmp_path: Path) -> None:
     """A text for a model, whatever is in it: never a path, and nothing that a shell sees."""
-    prompt, code = PROMPTS[case]
-    argv = arguments(inputs, "out", prompt=None, light=None, steps="9")
-    argv += ["--prompt=" + prompt]
-    if code:
-        assert_fails([*argv, "--validate"], code, "--prompt", cwd=tmp_path)
-    else:
-        validated(argv, tmp_path)
+    argv = arguments(inputs, "out", light=None, steps="9")
+    validated([*argv, "--prompt=" + PROMPTS[case]], tmp_path)
 
 
 def test_F4_longer_prompts_are_a_flag(inputs: Path, tmp_path: Path) -> None:
     argv = arguments(inputs, "out", light=None, steps="9", prompt="car " * 2000)
     validated([*argv, "--max-prompt-bytes", "8000"], tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("seed", "words"),
-    [("-1", "at least 0"), (str(2**64), "at most"), (str(2**32), "at most"), ("1.5", "whole")],
-    ids=["F8-minus-1", "F8-2^64", "F8-2^32", "F8-fraction"],
-)
-def test_seeds(seed: str, words: str, inputs: Path, tmp_path: Path) -> None:
-    argv = arguments(inputs, "out", seed=seed)
-    assert_fails(argv, ExitCode.USAGE, "--seed", words, cwd=tmp_path)
-    validated(arguments(inputs, "out", seed=str(2**32 - 1)), tmp_path)
 
 
 @pytest.mark.slow
