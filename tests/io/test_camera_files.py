@@ -261,7 +261,6 @@ def test_every_reason_of_a_model_has_a_sentence() -> None:
 @pytest.mark.case("C6")
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
 def test_cut_or_long_colmap_binaries_are_refused(tmp_path: Path, file: str) -> None:
-    """Every shorter file, a longer one, and a count that cannot be are refused."""
     folder = write_binary_model(tmp_path / "0", *MODELS["PINHOLE"], still(2))
     content = (folder / file).read_bytes()
     wrong = [content[:n] for n in range(len(content))]
@@ -414,7 +413,6 @@ def test_waymo_projects_as_waymo_does(tmp_path: Path, rng: np.random.Generator, 
 
 
 def test_wrong_waymo_calibrations_are_named(tmp_path: Path) -> None:
-    """Counts, focal lengths and names."""
     good = calibration(np.eye(4))
     for content, reason, pointer in (
         ({**good, "intrinsic": WAYMO_NUMBERS[:8]}, "json.type", "/intrinsic"),
@@ -534,7 +532,6 @@ def test_C6_name_without_an_end(tmp_path: Path) -> None:
 
 @pytest.mark.case("C3")
 def test_wrong_gltf_cameras_are_named(tmp_path: Path) -> None:
-    """Orthographic, without an angle, several without a name, and none at all."""
     path = tmp_path / "scene.gltf"
     scene, steep = gltf_scene(np.eye(4)), gltf_scene(np.eye(4), yfov=3.2)
     empty = {"asset": {"version": "2.0"}, "nodes": [{}]}

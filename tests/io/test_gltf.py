@@ -4,7 +4,6 @@ The ids are the rows of the project's interoperability (G) and fault (M) tables.
 built in memory; the files of the development data are read where they exist.
 """
 
-import io
 import json
 import os
 import struct
@@ -28,7 +27,6 @@ from tests.builders.insertions import arguments
 from tests.builders.refusals import unreadable
 from tests.builders.shapes import box
 from tests.development_data import MESHES, needs_shared
-from warpir.app.config import InsertConfig
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.assets import load_asset
@@ -54,21 +52,14 @@ def load(folder: Path, builder: Builder, **options: Any) -> Asset:
 
 fails = partial(unreadable, load_asset)
 Plant = Callable[[Builder], object]
-FAULTS: dict[str, tuple[Plant, str, str, dict[str, object]]] = {}
-"""By case: what is planted; and of the error the reason, the start of the pointer, and fields."""
-
-
 PRIMITIVE, SPARSE = "/meshes/0/primitives/0", "/accessors/0/sparse"
 
 
-def fault(case: str, reason: str, pointer: str = "", **fields: object) -> Callable[[Plant], Plant]:
-    """Register a planted fault under its case id."""
-
-    def register(plant: Plant) -> Plant:
-        FAULTS[case] = (plant, reason, pointer, fields)
-        return plant
-
-    return register
+def fault(
+    plant: Plant, reason: str, pointer: str = "", **fields: object
+) -> tuple[Plant, str, str, dict[str, object]]:
+    """What is planted; and of the error the reason, the start of the pointer, and fields."""
+    return plant, reason, pointer, fields
 
 
 def node(**members: Any) -> Plant:
@@ -77,20 +68,6 @@ def node(**members: Any) -> Plant:
 
 def set_accessor(index: int, **members: Any) -> Plant:
     return lambda b: b.json["accessors"][index].update(members)
-
-
-fault("M3-G5-image-missing", "file.unreadable", "/images/0")(
-    lambda b: b.base_color({"uri": "gone.png"})
-)
-fault("M3-G5-image-corrupt", "texture.damaged", "/images/0")(
-    lambda b: b.base_color({"bufferView": b.view(png()[:40])})
-)
-fault("M3-G5-image-text", "texture.damaged", "/images/0")(
-    lambda b: b.base_color({"bufferView": b.view(b"plain text")})
-)
-fault("M3-G5-image-ktx2", "texture.format", "/images/0", found="KTX2")(
-    lambda b: b.base_color({"bufferView": b.view(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(64))})
-)
 
 
 def sparse(at: list[int], values: np.ndarray, code: str = "B", **members: Any) -> Plant:
@@ -109,148 +86,6 @@ def sparse(at: list[int], values: np.ndarray, code: str = "B", **members: Any) -
 
 
 ONE_ROW = np.full((1, 3), 9.0)
-fault("M6-G8-sparse-without-indices", "gltf.missing", f"{SPARSE}/indices")(
-    set_accessor(0, sparse={"count": 1})
-)
-fault(
-    "M6-G8-sparse-index-out-of-range",
-    "gltf.index_out_of_range",
-    f"{SPARSE}/indices",
-    found=4,
-    limit=4,
-)(sparse([4], ONE_ROW))
-fault("M6-G8-sparse-indices-not-increasing", "gltf.sparse_order", f"{SPARSE}/indices")(
-    sparse([2, 2], np.zeros((2, 3)))
-)
-fault("M6-G8-sparse-signed-indices", "gltf.component_type", f"{SPARSE}/indices", found=5120)(
-    sparse([1], ONE_ROW, "b")
-)
-fault("M6-G8-sparse-values-too-short", "gltf.beyond_data", f"{SPARSE}/values", found=24, limit=12)(
-    sparse([1, 2], ONE_ROW)
-)
-fault(
-    "M6-G8-sparse-count-lies", "gltf.beyond_data", f"{SPARSE}/indices", found=2147483648, limit=1
-)(sparse([1], ONE_ROW, count=2**31))
-fault("M6-G8-sparse-NaN", "gltf.not_finite", "/accessors/0", found=1)(sparse([1], ONE_ROW * np.nan))
-fault("M17-G12-unknown-extension", "gltf.extension", "/extensionsRequired", found="ACME_holograms")(
-    lambda b: b.json.update(extensionsRequired=["ACME_holograms"])
-)
-for name in (
-    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
-    "KHR_texture_basisu",
-):  # fmt: skip
-    fault(f"M17-G13-{name}", "gltf.extension", "/extensionsRequired", found=name)(
-        lambda b, name=name: b.json.update(extensionsRequired=[name])  # type: ignore[misc]
-    )
-fault("G14-M7-index-out-of-range", "gltf.index_out_of_range", PRIMITIVE, found=999, limit=4)(
-    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H")))
-)
-fault(
-    "M7-G14-index-restart-value", "gltf.index_out_of_range", PRIMITIVE, found=4294967295, limit=4
-)(lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2**32 - 1], "I"))))
-fault("M7-G14-indices-float", "gltf.component_type", PRIMITIVE)(
-    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2], "f")))
-)
-for name, array in {
-    "POSITION": CORNERS, "NORMAL": NORMALS, "TEXCOORD_0": UVS, "TANGENT": TANGENTS,
-    "COLOR_0": NORMALS,
-}.items():  # fmt: skip
-    for bad in (np.nan, np.inf):
-
-        @fault(f"M8-G15-{name}-{bad}", "gltf.not_finite", "/accessors/")
-        def _(b: Builder, name: str = name, array: Any = array, bad: float = bad) -> None:
-            poisoned = array.copy()
-            poisoned[2, 1] = bad
-            b.attribute(name, poisoned)
-
-
-fault("G16-M10-cycle", "gltf.cycle", "/", found=2)(
-    lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}])
-)
-fault("M10-G16-self-child", "gltf.cycle", "/", found=1)(node(children=[0]))
-fault("G16-M10-two-parents", "gltf.two_parents", "/nodes/1", found=2)(
-    lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}]))
-)
-fault("M10-G16-same-child-twice", "gltf.two_parents", "/nodes/0", found=1)(
-    lambda b: (node(children=[1, 1])(b), b.json["nodes"].append({}))
-)
-fault("M10-G16-root-twice", "gltf.two_parents", "/scenes/0")(
-    lambda b: b.json.update(scenes=[{"nodes": [0, 0]}])
-)
-fault("G17-scene-out-of-range", "gltf.index_out_of_range", "/", found=7, limit=1)(
-    lambda b: b.json.update(scene=7)
-)
-fault("G17-scene-node-out-of-range", "gltf.index_out_of_range", "/scenes/0", found=7, limit=1)(
-    lambda b: b.json.update(scenes=[{"nodes": [7]}])
-)
-for mode in (0, 1, 2, 3):
-    fault(f"M12-G19-mode-{mode}-only", "mesh.nothing_to_render")(
-        lambda b, mode=mode: b.primitive.update(mode=mode)  # type: ignore[misc]
-    )
-fault("M12-G19-mode-7", "gltf.range", PRIMITIVE, found=7)(lambda b: b.primitive.update(mode=7))
-fault("M12-G19-empty-scene", "mesh.nothing_to_render")(lambda b: b.json.update(scenes=[{}]))
-fault("M12-G19-no-nodes", "mesh.nothing_to_render")(
-    lambda b: [b.json.pop(key) for key in ("nodes", "scenes", "scene")]
-)
-fault("G22-componentType-9999", "gltf.component_type", "/accessors/0", found=9999)(
-    set_accessor(0, componentType=9999)
-)
-fault("G22-child-99", "gltf.index_out_of_range", "/nodes/0", found=99, limit=1)(node(children=[99]))
-fault("G22-mesh-9", "gltf.index_out_of_range", "/nodes/0", found=9, limit=1)(node(mesh=9))
-fault("G22-mesh-is-text", "gltf.type", "/nodes/0")(node(mesh="0"))
-fault("G22-mesh-is-true", "gltf.type", "/nodes/0")(node(mesh=True))
-fault("G22-accessor-99", "gltf.index_out_of_range", PRIMITIVE, found=99, limit=4)(
-    lambda b: b.primitive["attributes"].update(POSITION=99)
-)
-fault("G22-no-position", "gltf.missing", "/meshes/0/primitives/0/attributes")(
-    lambda b: b.primitive["attributes"].pop("POSITION")
-)
-fault("G22-material-5", "gltf.index_out_of_range", PRIMITIVE, found=5, limit=1)(
-    lambda b: b.primitive.update(material=5)
-)
-fault("G22-view-too-long", "gltf.beyond_data", "/bufferViews/0", found=1048576, limit=140)(
-    lambda b: b.json["bufferViews"][0].update(byteLength=1 << 20)
-)
-fault("G22-buffer-too-long", "gltf.beyond_data", "/buffers/0", found=1048576, limit=140)(
-    lambda b: b.json["buffers"][0].update(byteLength=1 << 20)
-)
-fault("G22-wrong-type", "gltf.type", "/accessors/4", found="VEC2")(
-    lambda b: b.attribute("POSITION", UVS)
-)
-fault("G22-counts-differ", "gltf.count", PRIMITIVE, found=3, limit=4)(
-    lambda b: b.attribute("NORMAL", NORMALS[:3])
-)
-fault("G22-color-not-normalized", "gltf.component_type", PRIMITIVE)(
-    lambda b: b.attribute("COLOR_0", np.full((4, 3), 9, "B"))
-)
-fault("G22-asset-version-1", "gltf.version", "/", found="1.0")(
-    lambda b: b.json.update(asset={"version": "1.0"})
-)
-fault(
-    "G22-texCoord-2",
-    "gltf.uv_set",
-    "/materials/0/pbrMetallicRoughness/baseColorTexture",
-    found=2,
-    limit=1,
-)(lambda b: b.base_color().update(texCoord=2))
-fault("M6-G23-count-2^31-no-view", "gltf.missing", "/accessors/0")(
-    lambda b: (
-        b.json["accessors"][0].pop("bufferView"),
-        b.primitive.pop("indices"),
-        set_accessor(0, count=40_000_000)(b),
-    )
-)
-fault("M6-G23-count-2^31-limit", "limit.triangles", found=715827882, limit=20000000)(
-    lambda b: (b.primitive.pop("indices"), set_accessor(0, count=2**31)(b))
-)
-fault("M11-G25-zero-scale", "gltf.singular", "/nodes/0")(node(scale=[1, 0, 1]))
-fault("M11-G25-zero-quaternion", "gltf.matrix", "/nodes/0")(node(rotation=[0, 0, 0, 0]))
-fault("G28-M10-2^18-instances", "limit.nodes", "/nodes", found=262144, limit=100000)(
-    lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18)
-)
-fault("M10-G28-too-many-placed", "limit.instances", "/", found=65537, limit=65536)(
-    lambda b: b.json.update(nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}])
-)
 
 
 def zeros(b: Builder) -> None:
@@ -259,14 +94,6 @@ def zeros(b: Builder) -> None:
     b.json["accessors"][0].pop("bufferView")
     b.json["accessors"][0].update(count=10_000_000 * 3)
     b.primitive.pop("indices")
-
-
-fault("M6-G23-sparse-zeros", "gltf.too_large", "/accessors/0", found=360000000, limit=268435456)(
-    zeros
-)
-fault("M6-G23-normal-count-2^31", "gltf.count", PRIMITIVE, found=2147483648, limit=4)(
-    set_accessor(1, count=2**31)
-)
 
 
 def instanced(**attributes: np.ndarray) -> Plant:
@@ -283,85 +110,204 @@ def instanced(**attributes: np.ndarray) -> Plant:
     return plant
 
 
+def poisoned(name: str, array: np.ndarray, bad: float) -> Plant:
+    values = array.copy()
+    values[2, 1] = bad
+    return lambda b: b.attribute(name, values)
+
+
 INSTANCING = "/nodes/0/extensions/EXT_mesh_gpu_instancing/attributes"
-fault("M10-G28-instances-without-attributes", "gltf.count", INSTANCING)(instanced())
-fault("M10-G28-instances-unequal", "gltf.count", INSTANCING)(
-    instanced(TRANSLATION=np.zeros((2, 3), "f"), SCALE=np.ones((3, 3), "f"))
-)
-fault("M10-G28-instances-2^18", "limit.instances", INSTANCING, found=262144, limit=65536)(
-    instanced(TRANSLATION=np.zeros((2**18, 3), "f"))
-)
-fault("M10-G28-instances-of-two-nodes", "limit.instances", "/", found=80000, limit=65536)(
-    lambda b: (
-        instanced(TRANSLATION=np.zeros((40_000, 3), "f"))(b),
-        b.json["nodes"].append(b.json["nodes"][0]),
-        b.json.update(scenes=[{"nodes": [0, 1]}]),
-    )
-)
-fault("M11-G25-instance-of-zero-scale", "gltf.singular", "/nodes/0")(
-    instanced(SCALE=np.array([[1, 1, 1], [0, 1, 0]], "f"))
-)
-fault("M11-G25-instance-of-zero-quaternion", "gltf.matrix", INSTANCING)(
-    instanced(ROTATION=np.zeros((1, 4), "f"))
-)
-fault("M8-G15-instance-NaN", "gltf.not_finite", "/accessors/4", found=1)(
-    instanced(TRANSLATION=np.full((1, 3), np.nan, "f"))
-)
-fault("M6-past-the-buffer", "gltf.beyond_data", "/accessors/0", found=60, limit=48)(
-    set_accessor(0, count=5)
-)
-fault("M6-negative-offset", "gltf.range", "/accessors/0", found=-4, limit=0)(
-    set_accessor(0, byteOffset=-4)
-)
-fault("M6-view-negative-offset", "gltf.range", "/bufferViews/0", found=-4, limit=0)(
-    lambda b: b.json["bufferViews"][0].update(byteOffset=-4)
-)
-for stride in (0, 1):
-    fault(f"M6-stride-{stride}", "gltf.stride", "/bufferViews/0", found=stride, limit=12)(
-        lambda b, stride=stride: b.json["bufferViews"][0].update(byteStride=stride)  # type: ignore[misc]
-    )
-fault("M6-count-0", "gltf.range", "/accessors/0", found=0, limit=1)(set_accessor(0, count=0))
-fault("M11-scale-1e300", "gltf.transform_too_large", "/nodes/0")(node(scale=[1e300, 1, 1]))
-fault("M11-positions-1e30", "mesh.too_large")(
-    lambda b: b.attribute("POSITION", CORNERS * np.float32(1e30))
-)
-fault("M11-singular-matrix", "gltf.singular", "/nodes/0")(
-    node(matrix=[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
-)
-fault("M11-projective-matrix", "gltf.matrix", "/nodes/0")(
-    node(matrix=[1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
-)
-fault("M11-matrix-and-trs", "gltf.matrix", "/nodes/0")(
-    node(matrix=np.eye(4).ravel().tolist(), scale=[1, 1, 1])
-)
-fault("M11-short-scale", "gltf.type", "/nodes/0")(node(scale=[1, 1]))
-fault("M13-only-zero-area", "mesh.nothing_to_render")(
-    lambda b: b.primitive.update(indices=b.accessor(np.array([0, 0, 1], "H")))
-)
 
-
-def many_textures(b: Builder) -> None:
-    """64 textures of 8192 x 8192, of one bit and so of few bytes each."""
-    stream = io.BytesIO()
-    Image.new("1", (8192, 8192)).save(stream, "PNG")
-    view = b.view(stream.getvalue())
-    for _ in range(64):
-        b.texture({"bufferView": view, "mimeType": "image/png"})
-    b.json["materials"] = [
-        {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(64)
-    ]
-    b.json["meshes"][0]["primitives"] = [b.primitive | {"material": k} for k in range(64)]
-
-
-fault(
-    "M14-64-textures-of-8k", "limit.texture_pixels", "/images/7", found=536870912, limit=512000000
-)(many_textures)
-fault("M14-50M-triangles", "limit.triangles", found=50000000, limit=20000000)(
-    lambda b: (b.primitive.pop("indices"), set_accessor(0, count=150_000_000)(b))
-)
-fault("M18-alphaMode", "gltf.range", "/materials/0", found="GLOW")(
-    lambda b: b.material.update(alphaMode="GLOW")
-)
+FAULTS = {
+    "M3-G5-image-missing": fault(
+        lambda b: b.base_color({"uri": "gone.png"}), "file.unreadable", "/images/0"),
+    "M3-G5-image-corrupt": fault(
+        lambda b: b.base_color({"bufferView": b.view(png()[:40])}), "texture.damaged", "/images/0"),
+    "M3-G5-image-text": fault(
+        lambda b: b.base_color({"bufferView": b.view(b"plain text")}),
+        "texture.damaged", "/images/0"),
+    "M3-G5-image-ktx2": fault(
+        lambda b: b.base_color({"bufferView": b.view(b"\xabKTX 20\xbb\r\n\x1a\n" + bytes(64))}),
+        "texture.format", "/images/0", found="KTX2"),
+    "M6-G8-sparse-without-indices": fault(
+        set_accessor(0, sparse={"count": 1}), "gltf.missing", f"{SPARSE}/indices"),
+    "M6-G8-sparse-index-out-of-range": fault(
+        sparse([4], ONE_ROW), "gltf.index_out_of_range", f"{SPARSE}/indices", found=4, limit=4),
+    "M6-G8-sparse-indices-not-increasing": fault(
+        sparse([2, 2], np.zeros((2, 3))), "gltf.sparse_order", f"{SPARSE}/indices"),
+    "M6-G8-sparse-signed-indices": fault(
+        sparse([1], ONE_ROW, "b"), "gltf.component_type", f"{SPARSE}/indices", found=5120),
+    "M6-G8-sparse-values-too-short": fault(
+        sparse([1, 2], ONE_ROW), "gltf.beyond_data", f"{SPARSE}/values", found=24, limit=12),
+    "M6-G8-sparse-count-lies": fault(
+        sparse([1], ONE_ROW, count=2**31),
+        "gltf.beyond_data", f"{SPARSE}/indices", found=2147483648, limit=1),
+    "M6-G8-sparse-NaN": fault(
+        sparse([1], ONE_ROW * np.nan), "gltf.not_finite", "/accessors/0", found=1),
+    "M17-G12-unknown-extension": fault(
+        lambda b: b.json.update(extensionsRequired=["ACME_holograms"]),
+        "gltf.extension", "/extensionsRequired", found="ACME_holograms"),
+    "G14-M7-index-out-of-range": fault(
+        lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 999], "H"))),
+        "gltf.index_out_of_range", PRIMITIVE, found=999, limit=4),
+    "M7-G14-index-restart-value": fault(
+        lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2**32 - 1], "I"))),
+        "gltf.index_out_of_range", PRIMITIVE, found=4294967295, limit=4),
+    "M7-G14-indices-float": fault(
+        lambda b: b.primitive.update(indices=b.accessor(np.array([0, 1, 2], "f"))),
+        "gltf.component_type", PRIMITIVE),
+    "G16-M10-cycle": fault(
+        lambda b: b.json["nodes"].extend([{"children": [2]}, {"children": [1]}]),
+        "gltf.cycle", "/", found=2),
+    "M10-G16-self-child": fault(node(children=[0]), "gltf.cycle", "/", found=1),
+    "G16-M10-two-parents": fault(
+        lambda b: (node(children=[2])(b), b.json["nodes"].extend([{"children": [2]}, {}])),
+        "gltf.two_parents", "/nodes/1", found=2),
+    "M10-G16-same-child-twice": fault(
+        lambda b: (node(children=[1, 1])(b), b.json["nodes"].append({})),
+        "gltf.two_parents", "/nodes/0", found=1),
+    "M10-G16-root-twice": fault(
+        lambda b: b.json.update(scenes=[{"nodes": [0, 0]}]), "gltf.two_parents", "/scenes/0"),
+    "G17-scene-out-of-range": fault(
+        lambda b: b.json.update(scene=7), "gltf.index_out_of_range", "/", found=7, limit=1),
+    "G17-scene-node-out-of-range": fault(
+        lambda b: b.json.update(scenes=[{"nodes": [7]}]),
+        "gltf.index_out_of_range", "/scenes/0", found=7, limit=1),
+    "M12-G19-mode-7": fault(lambda b: b.primitive.update(mode=7), "gltf.range", PRIMITIVE, found=7),
+    "M12-G19-empty-scene": fault(lambda b: b.json.update(scenes=[{}]), "mesh.nothing_to_render"),
+    "M12-G19-no-nodes": fault(
+        lambda b: [b.json.pop(key) for key in ("nodes", "scenes", "scene")],
+        "mesh.nothing_to_render"),
+    "G22-componentType-9999": fault(
+        set_accessor(0, componentType=9999), "gltf.component_type", "/accessors/0", found=9999),
+    "G22-child-99": fault(
+        node(children=[99]), "gltf.index_out_of_range", "/nodes/0", found=99, limit=1),
+    "G22-mesh-9": fault(node(mesh=9), "gltf.index_out_of_range", "/nodes/0", found=9, limit=1),
+    "G22-mesh-is-text": fault(node(mesh="0"), "gltf.type", "/nodes/0"),
+    "G22-mesh-is-true": fault(node(mesh=True), "gltf.type", "/nodes/0"),
+    "G22-accessor-99": fault(
+        lambda b: b.primitive["attributes"].update(POSITION=99),
+        "gltf.index_out_of_range", PRIMITIVE, found=99, limit=4),
+    "G22-no-position": fault(
+        lambda b: b.primitive["attributes"].pop("POSITION"),
+        "gltf.missing", "/meshes/0/primitives/0/attributes"),
+    "G22-material-5": fault(
+        lambda b: b.primitive.update(material=5),
+        "gltf.index_out_of_range", PRIMITIVE, found=5, limit=1),
+    "G22-view-too-long": fault(
+        lambda b: b.json["bufferViews"][0].update(byteLength=1 << 20),
+        "gltf.beyond_data", "/bufferViews/0", found=1048576, limit=140),
+    "G22-buffer-too-long": fault(
+        lambda b: b.json["buffers"][0].update(byteLength=1 << 20),
+        "gltf.beyond_data", "/buffers/0", found=1048576, limit=140),
+    "G22-wrong-type": fault(
+        lambda b: b.attribute("POSITION", UVS), "gltf.type", "/accessors/4", found="VEC2"),
+    "G22-counts-differ": fault(
+        lambda b: b.attribute("NORMAL", NORMALS[:3]), "gltf.count", PRIMITIVE, found=3, limit=4),
+    "G22-color-not-normalized": fault(
+        lambda b: b.attribute("COLOR_0", np.full((4, 3), 9, "B")),
+        "gltf.component_type", PRIMITIVE),
+    "G22-asset-version-1": fault(
+        lambda b: b.json.update(asset={"version": "1.0"}), "gltf.version", "/", found="1.0"),
+    "G22-texCoord-2": fault(
+        lambda b: b.base_color().update(texCoord=2),
+        "gltf.uv_set", "/materials/0/pbrMetallicRoughness/baseColorTexture", found=2, limit=1),
+    "M6-G23-count-2^31-no-view": fault(
+        lambda b: (
+            b.json["accessors"][0].pop("bufferView"),
+            b.primitive.pop("indices"),
+            set_accessor(0, count=40_000_000)(b),
+        ),
+        "gltf.missing", "/accessors/0"),
+    "M6-G23-count-2^31-limit": fault(
+        lambda b: (b.primitive.pop("indices"), set_accessor(0, count=2**31)(b)),
+        "limit.triangles", found=715827882, limit=20000000),
+    "M11-G25-zero-scale": fault(node(scale=[1, 0, 1]), "gltf.singular", "/nodes/0"),
+    "M11-G25-zero-quaternion": fault(node(rotation=[0, 0, 0, 0]), "gltf.matrix", "/nodes/0"),
+    "G28-M10-2^18-instances": fault(
+        lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18),
+        "limit.nodes", "/nodes", found=262144, limit=100000),
+    "M10-G28-too-many-placed": fault(
+        lambda b: b.json.update(
+            nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}]),
+        "limit.instances", "/", found=65537, limit=65536),
+    "M6-G23-sparse-zeros": fault(
+        zeros, "gltf.too_large", "/accessors/0", found=360000000, limit=268435456),
+    "M6-G23-normal-count-2^31": fault(
+        set_accessor(1, count=2**31), "gltf.count", PRIMITIVE, found=2147483648, limit=4),
+    "M10-G28-instances-without-attributes": fault(instanced(), "gltf.count", INSTANCING),
+    "M10-G28-instances-unequal": fault(
+        instanced(TRANSLATION=np.zeros((2, 3), "f"), SCALE=np.ones((3, 3), "f")),
+        "gltf.count", INSTANCING),
+    "M10-G28-instances-2^18": fault(
+        instanced(TRANSLATION=np.zeros((2**18, 3), "f")),
+        "limit.instances", INSTANCING, found=262144, limit=65536),
+    "M10-G28-instances-of-two-nodes": fault(
+        lambda b: (
+            instanced(TRANSLATION=np.zeros((40_000, 3), "f"))(b),
+            b.json["nodes"].append(b.json["nodes"][0]),
+            b.json.update(scenes=[{"nodes": [0, 1]}]),
+        ),
+        "limit.instances", "/", found=80000, limit=65536),
+    "M11-G25-instance-of-zero-scale": fault(
+        instanced(SCALE=np.array([[1, 1, 1], [0, 1, 0]], "f")), "gltf.singular", "/nodes/0"),
+    "M11-G25-instance-of-zero-quaternion": fault(
+        instanced(ROTATION=np.zeros((1, 4), "f")), "gltf.matrix", INSTANCING),
+    "M8-G15-instance-NaN": fault(
+        instanced(TRANSLATION=np.full((1, 3), np.nan, "f")),
+        "gltf.not_finite", "/accessors/4", found=1),
+    "M6-past-the-buffer": fault(
+        set_accessor(0, count=5), "gltf.beyond_data", "/accessors/0", found=60, limit=48),
+    "M6-negative-offset": fault(
+        set_accessor(0, byteOffset=-4), "gltf.range", "/accessors/0", found=-4, limit=0),
+    "M6-view-negative-offset": fault(
+        lambda b: b.json["bufferViews"][0].update(byteOffset=-4),
+        "gltf.range", "/bufferViews/0", found=-4, limit=0),
+    "M6-count-0": fault(set_accessor(0, count=0), "gltf.range", "/accessors/0", found=0, limit=1),
+    "M11-scale-1e300": fault(node(scale=[1e300, 1, 1]), "gltf.transform_too_large", "/nodes/0"),
+    "M11-positions-1e30": fault(
+        lambda b: b.attribute("POSITION", CORNERS * np.float32(1e30)), "mesh.too_large"),
+    "M11-singular-matrix": fault(
+        node(matrix=[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "gltf.singular", "/nodes/0"),
+    "M11-projective-matrix": fault(
+        node(matrix=[1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "gltf.matrix", "/nodes/0"),
+    "M11-matrix-and-trs": fault(
+        node(matrix=np.eye(4).ravel().tolist(), scale=[1, 1, 1]), "gltf.matrix", "/nodes/0"),
+    "M11-short-scale": fault(node(scale=[1, 1]), "gltf.type", "/nodes/0"),
+    "M13-only-zero-area": fault(
+        lambda b: b.primitive.update(indices=b.accessor(np.array([0, 0, 1], "H"))),
+        "mesh.nothing_to_render"),
+    "M18-alphaMode": fault(
+        lambda b: b.material.update(alphaMode="GLOW"), "gltf.range", "/materials/0", found="GLOW"),
+    **{
+        f"M17-G13-{name}": fault(
+            lambda b, name=name: b.json.update(extensionsRequired=[name]),
+            "gltf.extension", "/extensionsRequired", found=name)
+        for name in (
+            "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression",
+            "KHR_texture_basisu",
+        )
+    },
+    **{
+        f"M8-G15-{name}-{bad}": fault(poisoned(name, array, bad), "gltf.not_finite", "/accessors/")
+        for name, array in {
+            "POSITION": CORNERS, "NORMAL": NORMALS, "TEXCOORD_0": UVS, "TANGENT": TANGENTS,
+            "COLOR_0": NORMALS,
+        }.items()
+        for bad in (np.nan, np.inf)
+    },
+    **{
+        f"M12-G19-mode-{mode}-only": fault(
+            lambda b, mode=mode: b.primitive.update(mode=mode), "mesh.nothing_to_render")
+        for mode in (0, 1, 2, 3)
+    },
+    **{
+        f"M6-stride-{stride}": fault(
+            lambda b, stride=stride: b.json["bufferViews"][0].update(byteStride=stride),
+            "gltf.stride", "/bufferViews/0", found=stride, limit=12)
+        for stride in (0, 1)
+    },
+}  # fmt: skip
 
 
 def planted(case: str, folder: Path) -> Path:
@@ -409,7 +355,6 @@ SENTENCES: dict[str, tuple[str, ...]] = {
     "M6-G23-sparse-zeros": ("/accessors/0: 360000000 bytes of zeros (limit 268435456)",),
     "M11-scale-1e300": ("/nodes/0: transform with numbers beyond 1e+18",),
     "M11-positions-1e30": ("coordinates up to 1e+30", "1e+18"),
-    "M14-64-textures-of-8k": ("texture pixels", "512000000"),
     "G18-vertex-without-weight": ("/meshes/0/primitives/0: vertex 3 has no weight",),
     "M6-stride-1": ("/bufferViews/0: byteStride 1, but elements of 12",),
 }
@@ -418,12 +363,10 @@ SENTENCES: dict[str, tuple[str, ...]] = {
 
 @pytest.mark.parametrize("case", SENTENCES)
 def test_sentence_of_a_reason(case: str, tmp_path: Path) -> None:
-    """The sentence names the place, what was found and what was expected."""
     fails(planted(case, tmp_path), *SENTENCES[case])
 
 
 def test_every_reason_has_a_sentence() -> None:
-    """Of each reason that the planted faults have, one sentence is read."""
     reasons = {reason for _, reason, _, _ in FAULTS.values()}
     assert reasons == {FAULTS[case][1] for case in SENTENCES}
 
@@ -451,50 +394,42 @@ URIS = {
 }  # fmt: skip
 
 
+def with_uri(uri: str, what: str, folder: Path) -> Path:
+    """An asset in a folder of its own, with a link to the file beside that, and to its folder."""
+    (folder / "asset").mkdir()
+    builder = Builder()
+    (folder / "secret.png").write_bytes(png() if what == "image" else bytes(builder.binary))
+    for name, target in (("link.png", "../secret.png"), ("folder", ".."), ("loop.png", "loop.png")):
+        (folder / "asset" / name).symlink_to(target)
+    path = folder / "asset" / "asset.gltf"
+    if what == "image":
+        builder.base_color({"uri": uri})
+        path.write_text(builder.gltf())
+    else:
+        builder.json["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(builder.json))
+    return path
+
+
 @pytest.mark.parametrize("what", ["image", "buffer"])
 @pytest.mark.parametrize("case", URIS, ids="M4-{}".format)
 def test_uri_opens_nothing_outside(case: str, what: str, inputs: Path, tmp_path: Path) -> None:
     """Of images and of buffers: refused by the program, without a socket."""
-    folder = tmp_path / "asset"
-    folder.mkdir()
-    builder = Builder()
-    (tmp_path / "secret.png").write_bytes(png() if what == "image" else bytes(builder.binary))
-    (folder / "link.png").symlink_to(tmp_path / "secret.png")
-    (folder / "folder").symlink_to(tmp_path)
-    if what == "image":
-        builder.base_color({"uri": URIS[case]})
-        (folder / "asset.gltf").write_text(builder.gltf())
-    else:
-        builder.json["buffers"][0]["uri"] = URIS[case]
-        (folder / "asset.gltf").write_text(json.dumps(builder.json))
+    with_uri(URIS[case], what, tmp_path)
     argv = arguments(inputs, "out", asset="asset/asset.gltf", device="cpu")
     assert_fails(argv, 3, "asset.gltf", f"/{what}s/0", "outside", cwd=tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("name", "start", "size"),
-    [
-        pytest.param("a.gltf", b"{", 1 << 30, id="M2-json-1GB"),
-        pytest.param("a.gltf", b"[" * 100_000, 100_000, id="M2-100000-brackets-at-the-program"),
-        pytest.param(
-            "a.glb",
-            struct.pack("<4sIII4s", b"glTF", 2, 1 << 28, (1 << 28) - 20, b"JSON"),
-            1 << 28,
-            id="M2-json-256MB-in-glb",
-        ),
-        pytest.param("a.glb", b"glTF", 3 << 30, id="M1-file-3GB"),
-        pytest.param("a.obj", b"v 0 0 0", 3 << 30, id="M20-file-3GB"),
-    ],
-)
-def test_huge_file_is_not_read(
-    name: str, start: bytes, size: int, inputs: Path, tmp_path: Path
-) -> None:
-    """A sparse file takes no room on the disk; it must take none in memory either."""
-    with (tmp_path / name).open("wb") as stream:
-        stream.write(start)
-        stream.truncate(size)
-    argv = arguments(inputs, "out", asset=name, device="cpu")
-    assert_fails(argv, 3, name, cwd=tmp_path)
+@pytest.mark.case("M4")
+@pytest.mark.parametrize("uri", [*URIS.values(), "nul%00.png", ""])
+def test_G24_no_texture_from_outside_becomes_grey(uri: str, tmp_path: Path) -> None:
+    path = with_uri(uri, "image", tmp_path)
+    fails(path, "/images/0", "outside", missing_textures="grey")
+
+
+@pytest.mark.case("M4")
+def test_G24_link_to_itself_is_refused(tmp_path: Path) -> None:
+    fails(with_uri("loop.png", "image", tmp_path), "/images/0")
 
 
 def test_unchanged_builder_loads(tmp_path: Path) -> None:
@@ -529,7 +464,6 @@ CONTAINERS: dict[str, tuple[Callable[[bytes], bytes], tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", CONTAINERS)
 def test_damaged_container_is_named_with_offset(case: str, tmp_path: Path) -> None:
-    """A damaged ``.glb`` is refused with the byte at fault."""
     damage, words = CONTAINERS[case]
     path = tmp_path / "asset.glb"
     path.write_bytes(damage(Builder().glb()))
@@ -550,7 +484,6 @@ TEXTS: dict[str, tuple[str | bytes, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", TEXTS)
 def test_damaged_json_is_named_with_position(case: str, tmp_path: Path) -> None:
-    """A damaged ``.gltf`` is refused with its position."""
     text, words = TEXTS[case]
     path = tmp_path / "asset.gltf"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -559,7 +492,6 @@ def test_damaged_json_is_named_with_position(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.case("M6")
 def test_G23_huge_count_allocates_little(tmp_path: Path) -> None:
-    """An accessor of 2^31 elements in a small file is refused in under 50 MB."""
     builder = Builder()
     FAULTS["M6-G23-count-2^31-limit"][0](builder)
     tracemalloc.start()
@@ -572,34 +504,7 @@ def test_G23_huge_count_allocates_little(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M4")
-@pytest.mark.parametrize(
-    "uri",
-    [
-        "../secret.png", "%2e%2e/secret.png", "a/../../secret.png", "/etc/hostname",
-        "file:///etc/hostname", "http://127.0.0.1:9/x.png", "C:\\x.png", "link.png",
-        "folder/secret.png", "loop.png", "nul%00.png", "",
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("policy", ["error", "grey"])
-def test_G24_uri_outside_the_folder_is_not_read(uri: str, policy: str, tmp_path: Path) -> None:
-    """Parent, absolute, linked and remote URIs are refused under either policy."""
-    folder = tmp_path / "asset"
-    folder.mkdir()
-    (tmp_path / "secret.png").write_bytes(png())
-    (folder / "link.png").symlink_to(tmp_path / "secret.png")
-    (folder / "folder").symlink_to(tmp_path)
-    (folder / "loop.png").symlink_to(folder / "loop.png")
-    builder = Builder()
-    builder.base_color({"uri": uri})
-    path = written(folder, builder)
-    if uri == "loop.png" and policy == "grey":
-        return  # a loop inside the folder is a missing file
-    fails(path, "/images/0", *(() if uri == "loop.png" else ("outside",)), missing_textures=policy)
-
-
-@pytest.mark.case("M4")
 def test_G24_no_fallback_to_the_base_name(tmp_path: Path) -> None:
-    """``a/b/x.png`` never reads ``x.png``."""
     (tmp_path / "x.png").write_bytes(png())
     builder = Builder()
     builder.base_color({"uri": "a/b/x.png"})
@@ -608,7 +513,6 @@ def test_G24_no_fallback_to_the_base_name(tmp_path: Path) -> None:
 
 @pytest.mark.case("M3")
 def test_M3_missing_buffer_is_refused(tmp_path: Path) -> None:
-    """A ``.gltf`` whose ``.bin`` is absent is refused; so is a FIFO in its place."""
     builder = Builder()
     builder.json["buffers"][0]["uri"] = "mesh.bin"
     path = tmp_path / "asset.gltf"
@@ -619,7 +523,6 @@ def test_M3_missing_buffer_is_refused(tmp_path: Path) -> None:
 
 
 def test_missing_file_folder_and_kind(tmp_path: Path) -> None:
-    """A path that is absent, a folder or of another kind is refused."""
     fails(tmp_path / "none.glb", "No such file")
     (tmp_path / "folder.glb").mkdir()
     fails(tmp_path / "folder.glb", "not a regular file")
@@ -628,7 +531,6 @@ def test_missing_file_folder_and_kind(tmp_path: Path) -> None:
 @pytest.mark.case("M21")
 @pytest.mark.parametrize("suffix", [".fbx", ".usdz", ".blend", ".zip", ""])
 def test_M21_other_kinds_are_refused(suffix: str, tmp_path: Path) -> None:
-    """Formats without a reader are refused with the way out."""
     path = tmp_path / f"asset{suffix}"
     path.write_bytes(b"x")
     fails(path, "convert it to GLB")
@@ -638,7 +540,6 @@ def test_M21_other_kinds_are_refused(suffix: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["glb", "base64", "bin"])
 def test_G1_containers_agree(kind: str, tmp_path: Path) -> None:
-    """``.glb``, base64 and separate buffers hold the same square."""
     builder = Builder()
     path = tmp_path / ("asset.glb" if kind == "glb" else "asset.gltf")
     if kind == "glb":
@@ -673,7 +574,6 @@ def test_G1_index_and_layout_kinds(code: str, tmp_path: Path) -> None:
 
 
 def test_G1_material_values(tmp_path: Path) -> None:
-    """Factors, textures, alpha and sides reach the record."""
     builder = Builder()
     builder.pbr.update(metallicFactor=0.25, roughnessFactor=0.75, baseColorFactor=[1, 0.5, 0.25, 1])
     builder.base_color()
@@ -728,7 +628,6 @@ def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
      ("sch%C3%B6n.png", "sch\u00f6n.png"), ("a/../b%252e.png", "b%2e.png")],
 )  # fmt: skip
 def test_G4_M5_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
-    """Percent-encoded and UTF-8 names load, decoded exactly once."""
     (tmp_path / name).write_bytes(png())
     builder = Builder()
     builder.base_color({"uri": uri})
@@ -765,7 +664,6 @@ def test_G5_missing_textures_become_grey_on_request(image: str, tmp_path: Path) 
 def test_G6_M9_normalised_uv_equals_float(
     codes: np.ndarray, values: list[float], tmp_path: Path
 ) -> None:
-    """Normalised integer texture coordinates equal their float version."""
     builder = Builder()
     builder.attribute("TEXCOORD_0", codes, normalized=True)
     uv0 = load(tmp_path, builder).primitives[0].uv0
@@ -774,7 +672,6 @@ def test_G6_M9_normalised_uv_equals_float(
 
 @pytest.mark.case("M9")
 def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
-    """Normalised u8 RGBA and u16 RGB vertex colours equal their float version."""
     builder = Builder()
     for codes, scale in ((np.full((4, 4), 51, "B"), 255), (np.full((4, 3), 13107, "H"), 65535)):
         builder.attribute("COLOR_0", codes, normalized=True)
@@ -787,7 +684,6 @@ def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
 @pytest.mark.parametrize("code", ["b", "B", "h", "H"])
 @pytest.mark.parametrize("normalized", [False, True])
 def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
-    """Quantised positions and normals under a node's scale equal the float version."""
     top = np.iinfo(code).max
     builder = Builder()
     builder.json["extensionsRequired"] = ["KHR_mesh_quantization"]
@@ -846,7 +742,6 @@ def test_G8_sparse_accessor_of_a_morph_target_is_never_read(tmp_path: Path) -> N
 
 
 def test_G9_tangents_and_second_uv_are_used(tmp_path: Path) -> None:
-    """TANGENT, TEXCOORD_1 and ``texCoord`` reach the record."""
     builder = Builder()
     builder.attribute("TANGENT", TANGENTS * np.array([1, 1, 1, -1], "f"))
     builder.attribute("TEXCOORD_1", UVS / 2)
@@ -987,7 +882,6 @@ def test_G11_layers_are_read(tmp_path: Path) -> None:
 
 
 def test_G11_layers_are_clamped(tmp_path: Path) -> None:
-    """Factors outside their range are brought into it, each with a notice."""
     builder = Builder()
     builder.material["extensions"] = {
         "KHR_materials_ior": {"ior": 0.5},
@@ -1154,7 +1048,6 @@ def test_G11_specular_glossiness_is_converted(
     "name", ["KHR_texture_transform", "KHR_materials_clearcoat", "KHR_lights_punctual"]
 )
 def test_G12_known_required_extensions_load(name: str, tmp_path: Path) -> None:
-    """Extensions that are honoured, or safe to leave out, may be required."""
     builder = Builder()
     builder.json.update(extensionsRequired=[name], extensionsUsed=[name])
     load(tmp_path, builder)
@@ -1175,7 +1068,6 @@ def test_G13_used_but_not_required_reads_the_fallback(tmp_path: Path) -> None:
 
 @pytest.mark.case("M17")
 def test_G13_webp_is_read(tmp_path: Path) -> None:
-    """EXT_texture_webp is honoured."""
     builder = Builder()
     builder.json["extensionsRequired"] = ["EXT_texture_webp"]
     builder.base_color({"bufferView": builder.view(png(kind="WEBP")), "mimeType": "image/webp"})
@@ -1217,7 +1109,6 @@ def test_M14_texture_pixels_are_limited(tmp_path: Path) -> None:
 @pytest.mark.case("M14")
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply", "stl"])
 def test_M14_triangles_are_limited(kind: str, tmp_path: Path) -> None:
-    """Every reader stops at --max-triangles, and says how many there are."""
     facet = "facet normal 0 0 1\nouter loop\n" + "vertex 0 0 {}\n" * 3 + "endloop\nendfacet\n"
     content = {
         "glb": Builder().glb(),
@@ -1233,14 +1124,7 @@ def test_M14_triangles_are_limited(kind: str, tmp_path: Path) -> None:
     fails(path, *words, limits=Limits(triangles=1))
 
 
-@pytest.mark.case("M14")
-def test_M14_limits_are_those_of_the_flags() -> None:
-    """What holds without a flag holds in the library."""
-    assert InsertConfig().limits == LIMITS
-
-
 def test_G17_no_scenes_draws_the_roots(tmp_path: Path) -> None:
-    """Without scenes all root nodes are drawn, with a notice."""
     builder = Builder()
     del builder.json["scenes"], builder.json["scene"]
     asset = load(tmp_path, builder)
@@ -1249,7 +1133,6 @@ def test_G17_no_scenes_draws_the_roots(tmp_path: Path) -> None:
 
 
 def test_G17_scene_member_selects(tmp_path: Path) -> None:
-    """``scene`` selects; absent, the first scene is drawn."""
     builder = Builder()
     builder.json["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
     builder.json.update(scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1)
@@ -1287,17 +1170,18 @@ def skinned(weights: list[list[float]], bones: list[dict[str, Any]], **members: 
 
 HALF = [[1, 0], [1, 0], [0.5, 0.5], [0, 1]]
 ARM: list[dict[str, Any]] = [{"children": [2], "scale": [2, 2, 2]}, {"translation": [0, 0, 3]}]
-fault("G18-joint-out-of-range", "gltf.index_out_of_range", PRIMITIVE, found=1, limit=1)(
-    skinned(HALF, ARM[1:])
-)
-fault("G18-joint-is-no-node", "gltf.index_out_of_range", "/skins/0", found=9, limit=3)(
-    skinned(HALF, ARM, joints=[1, 9])
-)
-fault("G18-vertex-without-weight", "gltf.no_weight", PRIMITIVE)(skinned([*HALF[:3], [0, 0]], ARM))
-fault("G18-skin-without-joints", "gltf.missing", "/meshes/0/primitives/0/attributes")(
-    lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0"))
-)
-fault("G18-flat-joint", "gltf.singular", PRIMITIVE)(skinned(HALF, [{"scale": [1, 0, 1]}, {}]))
+FAULTS |= {
+    "G18-joint-out-of-range": fault(
+        skinned(HALF, ARM[1:]), "gltf.index_out_of_range", PRIMITIVE, found=1, limit=1),
+    "G18-joint-is-no-node": fault(
+        skinned(HALF, ARM, joints=[1, 9]), "gltf.index_out_of_range", "/skins/0", found=9, limit=3),
+    "G18-vertex-without-weight": fault(
+        skinned([*HALF[:3], [0, 0]], ARM), "gltf.no_weight", PRIMITIVE),
+    "G18-skin-without-joints": fault(
+        lambda b: (skinned(HALF, ARM)(b), b.primitive["attributes"].pop("JOINTS_0")),
+        "gltf.missing", "/meshes/0/primitives/0/attributes"),
+    "G18-flat-joint": fault(skinned(HALF, [{"scale": [1, 0, 1]}, {}]), "gltf.singular", PRIMITIVE),
+}  # fmt: skip
 
 
 def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
@@ -1330,7 +1214,6 @@ def test_G18_mirrored_skin_keeps_the_outside(tmp_path: Path) -> None:
 
 
 def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
-    """Skins, morph targets and animations give the rest pose and a notice each."""
     builder = Builder()
     skinned([[1, 0]] * 4, [{}, {}])(builder)
     builder.json.update(animations=[{}])
@@ -1343,7 +1226,6 @@ def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
 
 @pytest.mark.case("M12")
 def test_G19_fan_is_expanded(tmp_path: Path) -> None:
-    """A fan of four corners gives both triangles with the same winding."""
     builder = Builder()
     builder.primitive.update(mode=6, indices=builder.accessor(np.array([0, 1, 2, 3], "B")))
     (square,) = load(tmp_path, builder).primitives
@@ -1352,7 +1234,6 @@ def test_G19_fan_is_expanded(tmp_path: Path) -> None:
 
 @pytest.mark.case("M12")
 def test_G19_lines_beside_triangles_are_noted(tmp_path: Path) -> None:
-    """Lines next to triangles are left out with a notice."""
     builder = Builder()
     builder.json["meshes"][0]["primitives"].append(builder.primitive | {"mode": 1})
     asset = load(tmp_path, builder)
@@ -1421,7 +1302,6 @@ def test_G26_absent_normals_mean_flat(tmp_path: Path) -> None:
 
 
 def test_zero_normals_come_from_the_faces(tmp_path: Path) -> None:
-    """A normal of length zero is replaced by the faces around it."""
     builder = Builder()
     builder.attribute("NORMAL", NORMALS * np.array([[1], [0], [2], [1]], "f"))
     asset = load(tmp_path, builder)
@@ -1430,7 +1310,6 @@ def test_zero_normals_come_from_the_faces(tmp_path: Path) -> None:
 
 
 def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
-    """A camera node passes its transform on to its children."""
     builder = Builder()
     builder.json["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}]
     builder.json["nodes"] = [{"camera": 0, "children": [1], "translation": [5, 0, 0]}, {"mesh": 0}]
@@ -1439,7 +1318,6 @@ def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
 
 @pytest.mark.case("M10")
 def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
-    """3000 nodes in one chain load, each moving the square a little."""
     builder = Builder()
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
     builder.json["nodes"] = [*chain, {"mesh": 0}]
@@ -1473,7 +1351,6 @@ def test_G28_instances_equal_nodes(code: str, tmp_path: Path) -> None:
 
 
 def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:
-    """Two materials on one mesh in two nodes give four primitives."""
     builder = Builder()
     builder.json["materials"].append({"name": "second"})
     builder.json["meshes"][0]["primitives"].append(builder.primitive | {"material": 1})
@@ -1486,7 +1363,6 @@ def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:
 
 @pytest.mark.case("M13")
 def test_M13_degenerate_and_repeated_triangles_are_counted(tmp_path: Path) -> None:
-    """Triangles without area and exact repetitions are dropped and counted."""
     builder = Builder()
     bad = np.array([[0, 1, 2], [0, 2, 3], [1, 1, 2], [2, 0, 1], [0, 2, 1]], "H")
     builder.primitive["indices"] = builder.accessor(bad.reshape(-1))
@@ -1569,7 +1445,6 @@ def test_M14_limit_of_texture_pixels_is_ours(
 
 @pytest.mark.case("M18")
 def test_M18_values_out_of_range_are_clamped(tmp_path: Path) -> None:
-    """Factors out of range are clamped, each with a notice."""
     builder = Builder()
     builder.pbr.update(metallicFactor=2, roughnessFactor=-1, baseColorFactor=[2, 0, 0, 1])
     builder.material.update(emissiveFactor=[-1, 0, 0], alphaCutoff=3)
@@ -1603,32 +1478,12 @@ def test_emission_beyond_all_light_is_refused(
 
 
 def test_hidden_node_is_not_drawn(tmp_path: Path) -> None:
-    """KHR_node_visibility hides a node and what hangs on it."""
     builder = Builder()
     builder.json["nodes"] += [
         {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}, {"mesh": 0}
     ]  # fmt: skip
     builder.json["scenes"] = [{"nodes": [0, 1]}]
     assert len(load(tmp_path, builder).primitives) == 1
-
-
-def test_byte_flips_give_an_asset_or_our_error(
-    tmp_path: Path, rng: np.random.Generator, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Damaged bytes anywhere end in an asset or in one InputError."""
-    builder = Builder()
-    builder.base_color()
-    original = np.frombuffer(builder.glb(), np.uint8)
-    path = tmp_path / "asset.glb"
-    for _ in range(300):
-        damaged = original.copy()
-        at = rng.integers(12, len(damaged), size=rng.integers(1, 6))
-        damaged[at] = rng.integers(0, 256, size=len(at))
-        path.write_bytes(damaged.tobytes())
-        try:
-            read_gltf(path)
-        except InputError as error:
-            assert error.where == str(path)
 
 
 ODD: tuple[Any, ...] = (
@@ -1688,7 +1543,6 @@ REAL = {  # triangles placed, those of zero area, primitives, textures read
 @needs_shared
 @pytest.mark.parametrize("name", REAL)
 def test_real_file_has_the_published_counts(name: str) -> None:
-    """Files of the development data have the triangles that their table states."""
     asset = load_asset(MESHES / name)
     triangle_count, flat_count, primitive_count, texture_count = REAL[name]
     assert sum(len(p.indices) for p in asset.primitives) == triangle_count - flat_count
@@ -1698,5 +1552,4 @@ def test_real_file_has_the_published_counts(name: str) -> None:
 @needs_shared
 @pytest.mark.parametrize("name", ["ToyCar_meshopt.glb", "mug_draco.gltf"])
 def test_real_compressed_file_is_refused(name: str) -> None:
-    """Compressed originals are refused by the name of their compression."""
     fails(MESHES / "compressed_originals" / name, "_compression", "re-export")

@@ -184,7 +184,6 @@ def assert_same_slots(ours: Asset, theirs: Asset) -> None:
 
 
 def test_what_is_written_reads_back_exactly(tmp_path: Path) -> None:
-    """Every array, factor, texture and wrap mode survives, bit for bit."""
     asset = everything()
     theirs = read_back(tmp_path, write_glb(asset, IDENTITY))
     for a, b in zip(asset.primitives, theirs.primitives, strict=True):
@@ -207,7 +206,6 @@ def test_material_extension_is_stated(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(EXTENDED.keys() & HONOURED))
 def test_material_extension_reads_back(name: str, tmp_path: Path) -> None:
-    """What our reader knows of an extension is what was written."""
     asset = extended(EXTENDED[name][0])
     assert_same_slots(asset, read_back(tmp_path, write_glb(asset, IDENTITY)))
 
@@ -232,7 +230,6 @@ def test_solid_glass_reads_back(tmp_path: Path) -> None:
 
 
 def test_plain_asset_uses_no_extension() -> None:
-    """What the core of glTF can say is said without extensions."""
     asset = Asset("plain", (patch(4, 0),), (Material(name="grey", emission=(0.5, 0.0, 0.0)),))
     written = document(write_glb(asset, IDENTITY))
     assert "extensionsUsed" not in written and "textures" not in written

@@ -423,7 +423,6 @@ def test_blender_script_is_short_and_its_numbers_are_ours(
 
 
 def test_object_stands_in_the_world(folder: Path) -> None:
-    """object.glb, read back, is the asset where the run placed it."""
     inputs = inputs_of(folder, rotate_y=25.0)
     placed = load_asset(folder / "out" / "object.glb")
     matrix = inputs.placement.asset_to_world
