@@ -250,7 +250,6 @@ def test_run_record_replays_the_run(run: Run, tmp_path: Path) -> None:
 
 
 def test_threads_do_not_change_the_files(run: Run, inputs: Path, tmp_path: Path) -> None:
-    """--threads 1 and 5 give the composite of all cores (R13)."""
     device = run.record["config"]["device"]
     for threads in ("1", "5"):
         out = tmp_path / threads
@@ -425,7 +424,6 @@ def test_light_rotate_turns_panorama_and_lobes(inputs: Path, tmp_path: Path, dev
 
 
 def test_cut_object_is_noted(inputs: Path, tmp_path: Path, device: str) -> None:
-    """An object that the frame cuts is inserted, with a notice (M22)."""
     out = tmp_path / "out"
     cut = go(arguments(inputs, out, place="-2.8,0,-5", device=device), out)
     assert any("cut by the photo's edge" in line for line in cut.record["notices"])
@@ -443,18 +441,6 @@ def results(tmp_path: Path) -> Path:
     (out / "composite.png").write_bytes(b"an earlier picture")
     (out / "run.json").write_text('{"format": 1, "files": {"composite.png": ""}}')
     return out
-
-
-def test_existing_results_are_kept_without_overwrite(
-    inputs: Path, results: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A folder with results is refused with status 7 and stays as it is; --overwrite replaces."""
-    before = digest(results)
-    assert main(arguments(inputs, results)) == ExitCode.OUTPUT
-    assert "--overwrite" in capsys.readouterr().err
-    assert digest(results) == before
-    assert main([*arguments(inputs, results), "--overwrite"]) == ExitCode.DONE
-    assert {p.name for p in results.iterdir()} == {*ALWAYS, "run.json"}
 
 
 def test_overwriting_leaves_no_file_of_the_old_run(inputs: Path, tmp_path: Path) -> None:

@@ -342,6 +342,7 @@ def test_a_configuration_beside_a_lora_is_read_as_json(tmp_path: Path) -> None:
 
 ALPHA_PATTERNS = [
     pytest.param(f"^{LAYER}", 7.0, id="L8-whole-name"),
+    pytest.param(f"^{LAYER}$", 7.0, id="L8-whole-name-and-end"),
     pytest.param(f"^{LAYER[3:]}", 4.0, id="L8-other-whole-name"),
     pytest.param("attn2.to_k", 7.0, id="L8-end"),
     pytest.param(r"attn2\.to_k", 7.0, id="L8-escaped-end"),

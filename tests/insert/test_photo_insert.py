@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -86,26 +85,6 @@ def test_untouched_pixels_keep_their_codes(inputs: Path, tmp_path: Path, case: s
         assert picture.info.get("icc_profile") == icc
 
 
-@pytest.mark.case("I19")
-def test_i19_metadata_of_the_photo_is_not_copied(inputs: Path, tmp_path: Path) -> None:
-    """Neither place nor maker nor a long XMP is in any file that is written."""
-    secret = "GPS-and-maker-of-the-photo"
-    exif = Image.Exif()
-    exif[0x010F] = secret
-    gps = exif.get_ifd(0x8825)
-    gps[1], gps[2], gps[29] = "N", (48.0, 51.0, 29.0), secret
-    xmp = f"<x:xmpmeta xmlns:x='adobe:ns:meta/'>{secret * 2000}</x:xmpmeta>".encode()
-    codes = read_image(inputs / "photo.png")[0]
-    path = tmp_path / "p.jpg"
-    Image.fromarray(codes).save(path, exif=exif, xmp=xmp[:60000], comment=secret)
-    assert path.read_bytes().count(secret.encode()) > 3
-    done = go(arguments(inputs, tmp_path / "out", photo=str(path)), tmp_path / "out")
-    for written in done.out.iterdir():
-        assert secret.encode() not in written.read_bytes(), written.name
-    with Image.open(done.out / "composite.png") as picture:
-        assert not picture.getexif()
-
-
 @pytest.mark.parametrize("case", ["I12-exr", "I12-hdr", "I12-tif"])
 def test_linear_plates_survive_in_the_layers(inputs: Path, tmp_path: Path, case: str) -> None:
     """layers.exr is the float composite, brighter than white; composite.png its sRGB, clipped."""
@@ -173,59 +152,6 @@ def test_i20_occluder_mask_end_to_end(inputs: Path, plain: Run, tmp_path: Path) 
     np.testing.assert_array_equal(done.image()[:, :24], photo[:, :24])
     np.testing.assert_array_equal(done.image()[:, 24:], plain.image()[:, 24:])
     assert len(done.record["inputs"]["occluder_mask"]) == 64
-
-
-def half_size_mask(folder: Path) -> dict[str, str]:
-    Image.fromarray(np.zeros((16, 24), np.uint8)).save(folder / "mask.png")
-    return {"occluder_mask": str(folder / "mask.png")}
-
-
-def color_mask(folder: Path) -> dict[str, str]:
-    write_photo(folder / "mask.png")
-    return {"occluder_mask": str(folder / "mask.png")}
-
-
-def bad_light(folder: Path) -> dict[str, str]:
-    texels = np.ones((4, 8, 3), np.float32)
-    texels[1, 1] = np.nan
-    return {"light": str(write_image(folder / "m.exr", texels)), "strict": ""}
-
-
-@pytest.mark.parametrize(
-    ("case", "make", "code", "words"),
-    [
-        ("I20-size", half_size_mask, 3, "mask.png: not of the photo's size (found 24 x 16"),
-        ("I20-color", color_mask, 3, "mask.png: not a mask"),
-        ("I20-missing", lambda f: {"occluder_mask": "none.png"}, 3, "none.png: no such file"),
-        ("E5-strict", bad_light, 3, "m.exr: not clean radiance"),
-        ("E-convention", lambda f: {"light_convention": "maya"}, 2, "--light-convention"),
-        (
-            "E-convention-of-lobes",
-            lambda f: {"light": str(f.parent / "lobes.json"), "light_convention": "blender"},
-            2,
-            "--light-convention: is for panoramas",
-        ),
-        ("E7-photo", lambda f: {"light": str(f.parent / "photo.png")}, 3, "expected 2:1"),
-        ("E8-no-layers", lambda f: {"layer": "beauty"}, 3, "photo.png: has no layers"),
-    ],
-)
-def test_bad_input_writes_nothing(
-    inputs: Path,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    case: str,
-    make: Any,
-    code: int,
-    words: str,
-) -> None:
-    """One line, the right exit code, no folder."""
-    folder = inputs / case
-    folder.mkdir()
-    argv = arguments(inputs, tmp_path / "out", **make(folder))
-    assert main(argv) == code
-    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1 and words in lines[0]
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
