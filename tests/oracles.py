@@ -433,9 +433,7 @@ def airy(R12: ArrayLike, R23: ArrayLike, delta: ArrayLike) -> Float64Array:
     return np.abs(-r12 + (1.0 - np.asarray(R12)) * r23 * wave / (1.0 - r12 * r23 * wave)) ** 2
 
 
-def film_fresnel(
-    f0: ArrayLike, ior: float, thickness: float, cosine: ArrayLike, orders: int = 2
-) -> Float64Array:
+def film_fresnel(f0: ArrayLike, ior: float, thickness: float, cosine: ArrayLike) -> Float64Array:
     """Return the reflectance of a thin film on a base, linear Rec.709, shape [..., 3].
 
     KHR_materials_iridescence, the spectral integral by quadrature over the wave number: the mean
@@ -447,7 +445,6 @@ def film_fresnel(
         ior: Of the film.
         thickness: Of the film [nm].
         cosine: Of the angle of incidence, shape [...].
-        orders: Of the series in the phase; the specification's is 2.
     """
     cosine = np.asarray(cosine, float)[..., None]
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / ior**2)
@@ -465,7 +462,7 @@ def film_fresnel(
             height = weight * np.sqrt(half) / 1.0685e-7
             nu = mean + np.sqrt(2.0 * half) * nodes
             delta = 2.0 * np.pi * path * nu + np.pi * turns[..., axis, None]
-            for m in range(1, orders + 1):
+            for m in (1, 2):  # of the series in the phase, as the specification has it
                 seen = height * (np.cos(m * delta) @ weights)[..., None]
                 varied = 2.0 * (Rs - (1.0 - R12)) * r123**m * seen
                 whole = whole + varied * XYZ_TO_REC709[:, axis]
@@ -588,8 +585,10 @@ def cosine_pdf(wi: ArrayLike) -> Float64Array:
     return np.maximum(0.0, np.asarray(wi, float)[..., 2]) / np.pi
 
 
-def specular_albedo(cos_o: float, alpha: float, f0: float, count: int = 1024) -> float:
-    """Return the share of light that the specular lobe reflects, by quadrature.
+def reflected_share(
+    cos_o: float, alpha: float, fresnel: Callable[[Float64Array], Float64Array], count: int = 1024
+) -> float:
+    """Return the share of light that a GGX lobe of this Fresnel term reflects, by quadrature.
 
     ``int F D G2 / (4 cos_o cos_i) cos_i dwi`` over half vectors: ``dwi = 4 (wo . wm) dwm``
     and ``tan^2 theta_m = alpha^2 u / (1 - u)``, whose density is ``D cos theta_m``, so that
@@ -606,9 +605,14 @@ def specular_albedo(cos_o: float, alpha: float, f0: float, count: int = 1024) ->
     cos_om = wm @ wo
     wi = 2.0 * cos_om[..., None] * wm - wo
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = schlick(f0, cos_om) * smith_g2(wo, wi, wm, alpha) * cos_om / (cos_o * wm[..., 2])
+        value = fresnel(cos_om) * smith_g2(wo, wi, wm, alpha) * cos_om / (cos_o * wm[..., 2])
     value = np.where((cos_om > 0.0) & (wi[..., 2] > 0.0), value, 0.0)
     return float(np.mean(value, axis=1) @ weight)
+
+
+def specular_albedo(cos_o: float, alpha: float, f0: float, count: int = 1024) -> float:
+    """Return the share of light that the specular lobe reflects (`reflected_share`)."""
+    return reflected_share(cos_o, alpha, lambda cos: schlick(f0, cos), count)
 
 
 def diffuse_albedo(cos_o: float, f0: float, count: int = 256) -> float:
@@ -871,33 +875,3 @@ def fresnel(cos_i: Float64Array, eta: float = 1.5) -> Float64Array:
     across = np.sin(theta - inner) / np.sin(theta + inner)
     along = np.tan(theta - inner) / np.tan(theta + inner)
     return np.where(sine < 1.0, 0.5 * (across**2 + along**2), 1.0)
-
-
-def coat_albedo(cos_o: float, alpha: float) -> float:
-    """Integrate the coat over its half vectors, F D G2 (o.h) / (cos_o cos_h) (Walter 2007)."""
-    count = 600
-    q = (np.arange(count) + 0.5) / count  # share of the normals, cosine-weighted
-    tan2 = alpha**2 * q / (1.0 - q)
-    cos_h = 1.0 / np.sqrt(1.0 + tan2)
-    sin_h = np.sqrt(1.0 - cos_h**2)
-    phi = 2.0 * np.pi * (np.arange(count) + 0.5) / count
-    h = np.stack(
-        [
-            sin_h[:, None] * np.cos(phi),
-            sin_h[:, None] * np.sin(phi),
-            np.tile(cos_h[:, None], count),
-        ],
-        axis=-1,
-    )
-    o = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
-    cos_d = h @ o
-    i_z = 2.0 * cos_d * h[..., 2] - cos_o
-
-    def hidden(z: Float64Array) -> Float64Array:
-        z = np.maximum(z, 1e-9)
-        return np.asarray(0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / z**2 - 1.0)) - 1.0))
-
-    G2 = 1.0 / (1.0 + hidden(np.array(cos_o)) + hidden(i_z))
-    valid = (cos_d > 0.0) & (i_z > 0.0)
-    f = fresnel(np.maximum(cos_d, 0.0)) * G2 * cos_d / (cos_o * h[..., 2])
-    return float(np.where(valid, f, 0.0).mean())

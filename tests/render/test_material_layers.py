@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.builders.shapes import box, camera, constant, lobe, placed, quad, sphere
-from tests.oracles import film_fresnel, sheen_albedo
+from tests.oracles import film_fresnel, schlick, sheen_albedo
 from tests.render.test_render import (
     BIAS,
     CARD_VIEW,
@@ -32,10 +32,6 @@ DARK = Material(base_color=(0.0, 0.0, 0.0), metallic=0.0, roughness=1.0)
 GLASS = Material(base_color=(0.5, 0.5, 0.5), metallic=0.0, roughness=0.4, transmission=1.0)
 CODES = (64, 128, 192, 96)
 SKY = lobe((0.3, 0.5, 1.0), 2.0)
-
-
-def schlick(f0: float, cosine: float) -> float:
-    return f0 + (1.0 - f0) * (1.0 - cosine) ** 5
 
 
 LAYERED = Material(

@@ -105,7 +105,7 @@ def test_coat_under_a_black_dome_loses_its_albedo(device: str, roughness: float)
     added = image_of(device, LAMBERT, constant(), roughness, 500.0, 1024)[:, 0]
     cos_o = -view_rays(VIEW, 8)[..., 1].mean(axis=1)
     pixels = np.flatnonzero(cos_o > 0.15)[::17]
-    expected = np.array([o.coat_albedo(c, roughness**2) for c in cos_o[pixels]])
+    expected = np.array([o.reflected_share(c, roughness**2, o.fresnel) for c in cos_o[pixels]])
     np.testing.assert_allclose(-added[pixels], expected, rtol=0.04)
     assert abs((-added[pixels] / expected).mean() - 1.0) < 5e-3
 
