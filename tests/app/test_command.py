@@ -77,7 +77,6 @@ def test_command_runs_as_a_module(tmp_path: Path) -> None:
 
 
 def test_command_help_tells_every_field(capsys: pytest.CaptureFixture[str]) -> None:
-    """Each field of the configuration is a flag with a help text."""
     assert warpir.insert.main(["--help-all"]) == 0
     text = capsys.readouterr().out
     docs = warpir.app.command.field_docs()
@@ -403,7 +402,6 @@ def test_words_of_other_programs_lead_to_our_flags() -> None:
 
 @pytest.mark.parametrize(("first", "second"), EXCLUSIVE)
 def test_command_refuses_flags_that_exclude_each_other(first: str, second: str) -> None:
-    """At most one of each pair may be given."""
     values = {
         "photo": "p.png", "asset": "a.glb", "camera": "c.json", "fov": "50", "pitch": "0",
         "roll": "1", "horizon": "5", "camera_height": "2", "place": "0,0,1", "at": "1,2",

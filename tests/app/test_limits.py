@@ -158,17 +158,6 @@ def results(folder: Path) -> None:
     (folder / "done" / "run.json").write_text("{}")
 
 
-def linked(name: str) -> Callable[[Path], None]:
-    """An earlier run whose folder of that name leads elsewhere."""
-
-    def make(folder: Path) -> None:
-        (folder / "elsewhere").mkdir()
-        (folder / "linked").mkdir()
-        (folder / "linked" / name).symlink_to("../elsewhere")
-
-    return make
-
-
 OUTS = {
     "F5-file": Out("plain", 7, ("plain", "a file in its place"),
                    lambda f: (f / "plain").write_text("x")),
@@ -184,8 +173,6 @@ OUTS = {
     "F5-below-read-only": Out("sealed/new/er", 5, ("sealed",), sealed, UNPRIVILEGED),
     "F5-long-name": Out("n" * 300, 5, ("name too long",)),
     "F5-full-disk": Out("new", 5, ("new", "found 1 MiB free; expected about"), before=FULL),
-    **{f"F5-link-{name}": Out("linked", 7, (f"linked/{name}: a link",), linked(name))
-       for name in ("progress", "checkpoints", "mitsuba")},
     "F5-existing-results": Out("done", 7, ("already holds files", "run.json"), results),
 }  # fmt: skip
 
@@ -199,7 +186,6 @@ def test_unusable_output_is_refused(
     bad = OUTS[case]
     bad.make(tmp_path)
     argv = [*arguments(inputs, bad.out.format(inputs=inputs)), *mode]
-    argv += ["--overwrite"] if "a link" in bad.words[0] else []
     lines = assert_fails(argv, bad.code, cwd=tmp_path, before=bad.before)
     for word in bad.words:
         assert word.lower() in lines[0].lower()
@@ -513,7 +499,6 @@ def test_what_is_no_file_is_never_opened(
 
 @pytest.mark.case("I1")
 def test_unreadable_photo(inputs: Path, tmp_path: Path) -> None:
-    """No permission to read is told as that."""
     path = tmp_path / "secret.png"
     path.write_bytes((inputs / "photo.png").read_bytes())
     path.chmod(0)

@@ -364,6 +364,5 @@ def test_run_is_never_written_over(
 
 
 def test_reuse_is_validated_without_renderer(inputs: Path, first: Run, tmp_path: Path) -> None:
-    """--validate of a run that reuses another loads neither torch nor Warp."""
     argv = arguments(inputs, "o", light=None, reuse=str(first.out))
     assert validated(argv, tmp_path, before=TELL).out.splitlines()[-1] == "loaded []"
