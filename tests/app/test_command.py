@@ -852,7 +852,7 @@ def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) ->
     ("change", "words"),
     [
         ({"format": "x"}, "not lobes"),
-        ({"lobes": []}, "/lobes"),
+        ({"lobes": []}, "/lobes: a list of 1 to 4096 lobes"),
         ({"lobes": [{"amplitude": [1, 2], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
         ({"lobes": [{"amplitude": [1, 2, -3], "axis": [0, 1, 0], "sharpness": 1}]}, "amplitude"),
         ({"lobes": [{"amplitude": [1, 2, 3], "axis": [0, 0, 0], "sharpness": 1}]}, "axis"),
