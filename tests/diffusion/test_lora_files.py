@@ -37,11 +37,11 @@ MORE = (*ATTENTION, "proj_in", "ff.net.0.proj", "ff.net.2", "conv1", "time_emb_p
 TRIGGER = "a scene in the style of sks rendering"
 
 
-def tiny_unet(cross_attention: int = 32, seed: int = 0) -> nn.Module:
+def tiny_unet(cross_attention: int = 32) -> nn.Module:
     from diffusers import UNet2DConditionModel
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         return UNet2DConditionModel(
             sample_size=8,
             block_out_channels=(16, 32),
@@ -332,19 +332,6 @@ def test_every_way_of_naming_is_read(tmp_path: Path, style: str, alpha: float) -
 
 
 @pytest.mark.case("L8")
-def test_patterns_of_layers_are_names(tmp_path: Path) -> None:
-    """An alpha for some layers is read; an expression that would never end is not run."""
-    lora = random_lora(bare_prior())
-    first = sorted(lora.alphas)[0]
-    for pattern in (first, f"^{first}$", first.replace(".", r"\.")):
-        read = read_lora(write_peft(lora, tmp_path, lora_alpha=4, alpha_pattern={pattern: 2}))
-        assert read.alphas[first] == 2.0 and set(read.alphas.values()) == {2.0, 4.0}
-    path = write_peft(lora, tmp_path, lora_alpha=4, alpha_pattern={"([a-z0-9_.]+)+X": 4})
-    with pytest.raises(ModelError, match="its configuration is damaged"):
-        read_lora(path)
-
-
-@pytest.mark.case("L8")
 def test_rank_stabilised_loras_keep_their_strength(tmp_path: Path) -> None:
     """The update is alpha / sqrt(rank) B A, as peft's configuration says."""
     path = write_peft(random_lora(bare_prior()), tmp_path, lora_alpha=3, use_rslora=True)
@@ -395,28 +382,16 @@ def test_a_lora_for_another_base_is_refused_in_one_sentence(tmp_path: Path) -> N
 
 
 def broken(kind: str, folder: Path) -> Path:
-    """Return a file with one fault."""
-    diffusers, kohya = save(random_lora(bare_prior()), folder)
-    whole, named, of_kohya = diffusers.read_bytes(), load_file(diffusers), load_file(kohya)
-    path = folder / ("broken.bin" if kind == "pickle" else "broken.safetensors")
+    """Return a file with one fault; `tests.insert.test_model_files` has what any reader meets."""
+    named, of_kohya = map(load_file, save(random_lora(bare_prior()), folder))
+    path = folder / "broken.safetensors"
     first, first_up = next(iter(named)), next(key for key in of_kohya if "lora_up" in key)
-    contents = {
-        "truncated": whole[:-100],
-        "huge header": (1 << 62).to_bytes(8, "little") + whole[8:],
-        "pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n",
-    }
     tensors = {
         "empty": {},
         "foreign": {"model.layers.0.weight": torch.ones(2)},
-        "some foreign": {**named, "unet.conv_in.weight": torch.ones(2)},
-        "one part": {k: v for k, v in named.items() if k != first},
         "not whole": {k: v for k, v in named.items() if "mid_block" not in k},
         "unknown layers": {k.replace("mid_block", "mid_blocks"): v for k, v in named.items()},
-        "nan": {**named, first: torch.full_like(named[first], math.nan)},
-        "rank 0": {k: v[:0] if ".down." in k else v[:, :0] for k, v in named.items()},
         "other shape": {**named, first: torch.ones(4, 5)},
-        "parts that do not fit": {**named, first: torch.ones(3, named[first].shape[1])},
-        "text encoder": {**of_kohya, "lora_te_text_model_x.lora_down.weight": torch.ones(2)},
         "weight decomposed": {**of_kohya, "lora_unet_mid_block_x.dora_scale": torch.ones(2)},
         "kohya without up": {k: v for k, v in of_kohya.items() if k != first_up},
         "alpha nan": {k: v * math.nan if "alpha" in k else v for k, v in of_kohya.items()},
@@ -428,41 +403,21 @@ def broken(kind: str, folder: Path) -> Path:
         "header alpha text": json.dumps({"unet.lora_alpha": "much"}),
         "dora in the header": json.dumps({"unet.lora_alpha": 4, "unet.use_dora": True}),
     }
-    if kind in ("pickle", "old pickle"):
-        torch.save(named, path, _use_new_zipfile_serialization=kind == "pickle")
-    elif kind in contents:
-        path.write_bytes(contents[kind])
-    elif kind == "folder":
-        path.mkdir()
-    elif kind != "absent":
-        header = {"lora_adapter_metadata": configs[kind]} if kind in configs else None
-        save_file(tensors.get(kind, named), path, header)
+    header = {"lora_adapter_metadata": configs[kind]} if kind in configs else None
+    save_file(tensors.get(kind, named), path, header)
     return path
 
 
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        pytest.param("pickle", "pickle", id="L8-pickle"),
-        pytest.param("old pickle", "pickle", id="L8-old-pickle"),
-        pytest.param("truncated", "whole safetensors", id="L8-truncated"),
-        pytest.param("huge header", "whole safetensors", id="L8-huge-header"),
-        pytest.param("pointer", "Git LFS", id="L8-pointer"),
-        pytest.param("absent", "no such file", id="L8-absent"),
-        pytest.param("folder", "is a folder", id="L8-folder"),
         pytest.param("empty", "no keys", id="L8-empty"),
         pytest.param("foreign", "1 of 1 keys are foreign", id="L8-foreign"),
-        pytest.param("some foreign", "1 of 65 keys are foreign", id="L8-some-foreign"),
-        pytest.param("one part", "only one of its two parts", id="L8-one-part"),
         pytest.param("not whole", "found 24 of 32 layers", id="L8-not-whole"),
         pytest.param(
             "unknown layers", "8 of its 32 layers are not in the model", id="L8-unknown-layers"
         ),
-        pytest.param("nan", "not finite", id="L8-nan"),
-        pytest.param("rank 0", "rank 0", id="L8-rank-0"),
         pytest.param("other shape", "another shape", id="L8-other-shape"),
-        pytest.param("parts that do not fit", "do not fit", id="L8-parts-that-do-not-fit"),
-        pytest.param("text encoder", "text encoder", id="L8-text-encoder"),
         pytest.param("weight decomposed", "foreign", id="L8-weight-decomposed"),
         pytest.param("kohya without up", "only one of its two parts", id="L8-kohya-without-up"),
         pytest.param("alpha nan", "alpha: values are not finite", id="L8-alpha-nan"),

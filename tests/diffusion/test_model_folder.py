@@ -109,16 +109,16 @@ def config_of(name: str, **values: object) -> Plant:
     return lambda f: edit_json(f / name, **values)
 
 
-def header_of(change: Callable[[dict[str, Any]], object], name: str = UNET) -> Plant:
+def header_of(change: Callable[[dict[str, Any]], object]) -> Plant:
     """Change the header of a file of weights, and leave the values behind it."""
 
     def plant(folder: Path) -> None:
-        content = (folder / name).read_bytes()
+        content = (folder / UNET).read_bytes()
         length = int.from_bytes(content[:8], "little")
         header = json.loads(content[8 : 8 + length])
         change(header)
         text = json.dumps(header).encode()
-        (folder / name).write_bytes(struct.pack("<Q", len(text)) + text + content[8 + length :])
+        (folder / UNET).write_bytes(struct.pack("<Q", len(text)) + text + content[8 + length :])
 
     return plant
 

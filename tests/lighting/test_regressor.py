@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -11,15 +10,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
 from scipy.integrate import quad
 
 from tests.builders.poses import rotation
 from tests.builders.shapes import a_regression
 from warpir.calibration.forward import softmax
-from warpir.core.errors import ExitCode, InputError
+from warpir.core.errors import InputError
 from warpir.core.latlong import map_directions
-from warpir.diffusion.models.weight_files import read_header, values_hash
 from warpir.lighting.regression import (
     camera_rays,
     facing_irradiance,
@@ -368,46 +365,6 @@ def test_file_keeps_the_network(tmp_path: Path) -> None:
 
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-500])
-
-
-def poison(path: Path) -> None:
-    content = path.read_bytes()
-    state = load_file(path)
-    state["members.0.stem.bias"][0] = torch.nan
-    length = int.from_bytes(content[:8], "little")
-    save_file(state, path, metadata=json.loads(content[8 : 8 + length])["__metadata__"])
-
-
-def resize_config(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b'\\"directions\\": 300', b'\\"directions\\": 200'))
-
-
-def other_network(path: Path) -> None:
-    """As if it had been written so."""
-    state, about = load_file(path), read_header(path).about
-    about["config"] = about["config"].replace('"directions": 300', '"directions": 200')
-    values = {name: part.numpy() for name, part in state.items()}
-    about["weights"] = values_hash(values, about["config"])
-    save_file(state, path, metadata=about)
-
-
-def other_kind(path: Path) -> None:
-    save_file({"weight": torch.zeros(3)}, path)
-
-
-FAULTS = [Path.unlink, cut, poison, resize_config, other_network, other_kind]
-
-
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"L2-{fault.__name__}")
-def test_file_faults_are_named(tmp_path: Path, fault: Callable[[Path], None]) -> None:
-    """Absent, cut off, not finite, of another size or another kind: one line, exit code 4."""
-    path = tmp_path / "regressor.safetensors"
-    save_regressor(random_regressor(0, SMALL), path, {})
-    load_regressor(path)
-    fault(path)
-    with pytest.raises(InputError, match=r"regressor\.safetensors: ") as caught:
-        load_regressor(path)
-    assert caught.value.code == ExitCode.MODEL and "\n" not in str(caught.value)
 
 
 # ---------------------------------------------------------------------------------------- loss

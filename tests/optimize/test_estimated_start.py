@@ -174,19 +174,6 @@ def test_judging_leaves_the_end_as_it_was(folder: Path, tmp_path: Path) -> None:
     assert same == numbers["is_accepted"]
 
 
-@pytest.mark.parametrize("validate", [False, True])
-def test_absent_weights_are_one_line(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], validate: bool
-) -> None:
-    """A file that is not there, before anything is written and in a look at the inputs."""
-    out = tmp_path / "out"
-    flags = argv(folder, out, regressor="/nowhere.safetensors")
-    assert main([*flags, *["--validate"] * validate]) == ExitCode.MODEL
-    error = capsys.readouterr().err
-    assert error.count("error:") == 1 and "/nowhere.safetensors" in error
-    assert not (out / "run.json").exists()
-
-
 def made_run(config: InsertConfig, folder: Path) -> Run:
     """A run whose output nobody looks at."""
     with OutputFolder(folder / "unused", overwrite=True) as output:

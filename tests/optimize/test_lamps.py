@@ -17,11 +17,10 @@ from warpir.core.errors import InputError
 from warpir.io.lamps_file import lamps_of, lamps_to_json
 from warpir.lighting.sg_light import LightBounds, narrowest
 from warpir.optimize.light import LampPowers, LightOptimization, Unknowns
-from warpir.optimize.loop import Guide
 from warpir.optimize.view import Frame
 from warpir.render.near.rows import with_lamps
 from warpir.scene.camera import Camera
-from warpir.scene.near.lamps import Lamp, SphereLamp
+from warpir.scene.near.lamps import SphereLamp
 
 LAMPS = (
     SphereLamp(np.array([-0.8, 1.4, -3.0]), 0.1, np.array([20.0, 16.0, 12.0])),
@@ -31,18 +30,16 @@ BOUNDS = LightBounds(narrowest(12), chroma=1.0, intensity=100.0)
 LIT = replace(SETTINGS, recover_lamps=True)
 
 
-def lit_frame(device: str, lamps: tuple[Lamp, ...] = LAMPS) -> Frame:
+def lit_frame(device: str) -> Frame:
     frame = a_frame(device)
-    return replace(frame, renderer=with_lamps(frame.renderer, lamps))
+    return replace(frame, renderer=with_lamps(frame.renderer, LAMPS))
 
 
-def lit_loop(
-    device: str, settings: OptimizeSettings, guide: Guide | None = None
-) -> LightOptimization:
+def lit_loop(device: str, settings: OptimizeSettings) -> LightOptimization:
     unknowns = bent()
     unknowns.lamps = LampPowers(LAMPS, BOUNDS)
     rows = TRACED if settings.integrator == "transport" else None
-    return LightOptimization(lit_frame(device), guide or Pull(), settings, unknowns, transport=rows)
+    return LightOptimization(lit_frame(device), Pull(), settings, unknowns, transport=rows)
 
 
 def test_lamps_gradient_against_central_differences(device: str) -> None:

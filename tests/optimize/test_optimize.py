@@ -20,14 +20,12 @@ from tests.builders.loops import (
     RATES,
     ROWS,
     SETTINGS,
-    STATM,
     TRACED,
     WIDTH,
     Pull,
     a_frame,
     a_loop,
     bent,
-    growth,
     values,
 )
 from tests.statistics import central_differences, compare_gradients
@@ -45,9 +43,6 @@ RELATIVE_L2, COSINE = 0.01, 0.9999
 """Of whole gradients. Measured: 0.004, of which half is the step's and half float32's noise."""
 MIS_COSINE, MIS_BIAS = 0.99, 0.02
 """Asked of `transport` against `mis`, as in `tests.render.test_transport`; three runs of each."""
-MEMORY_GROWTH = 4 << 20
-"""Of 100 steps [byte]; measured: 0.2 MiB, and 10 (mis) to 28 MiB if every picture were kept."""
-
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -326,15 +321,6 @@ def test_run_does_not_depend_on_threads(device: str, integrator: str) -> None:
         loop.run()
         ends.append(loop)
     assert changed(ends[0], values(ends[1])) == set()
-
-
-@pytest.mark.skipif(not STATM.exists(), reason="the system does not tell a process its memory")
-@pytest.mark.parametrize("integrator", ["transport", "mis"])
-@pytest.mark.slow
-def test_run_takes_flat_memory(device: str, integrator: str) -> None:
-    """After the first steps, a hundred more keep nothing but their numbers."""
-    steps, host, _ = growth(device, replace(SETTINGS, steps=120, integrator=integrator))
-    assert steps == 120 and host < MEMORY_GROWTH
 
 
 # ------------------------------------------------------------------------- what goes wrong
