@@ -21,6 +21,7 @@ from tests.builders.programs.placing import (
     drag,
     placing,
     press,
+    pull,
     save,
     settle,
 )
@@ -205,6 +206,27 @@ def test_two_fingers_zoom_and_add_no_lamp(inputs: Path, tmp_path: Path) -> None:
         page.locator("[data-handle=lamp1]").focus()
         press(opened, "Delete")
         assert [lamp["power"] for lamp in page.evaluate(STATE)["lamps"]] == [20.0]
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_press_beside_the_photo_leaves_the_page_usable(inputs: Path, tmp_path: Path) -> None:
+    """No lamp is added there, and an object that reaches out of the photo is dragged and let go."""
+    argv = command(inputs, tmp_path / "out", "--size", "4", "--at", "100,318")
+    with placing(argv, 900, 900) as opened:
+        page = opened.page
+        photo = box_of(opened, "#photo")
+        x, y = photo["x"] + 60.0, photo["y"] + photo["height"] + 4.0
+        page.click("#add-lamp")
+        page.mouse.click(x, photo["y"] - 60.0)
+        settle(opened)
+        assert page.evaluate(STATE)["lamps"] == []
+        page.click("#add-lamp")
+        before = page.evaluate(STATE)
+        pull(opened, (x, y), (x + 50.0, y))
+        assert page.evaluate(STATE)["stand"] != before["stand"]
+        press(opened, "Control+z")
+        assert page.evaluate(STATE) == before
 
 
 @pytest.mark.slow

@@ -112,9 +112,9 @@ export class Lamps {
     return { center: eye.map((part, k) => part + (offset[k] * Math.min(distance, most)) / length) };
   }
 
-  // Put a lamp where a pointer was pressed, and let it follow; returns whether it does.
+  // Put a lamp where a pointer was pressed in the photo, and let it follow; returns whether it does.
   press(pressed, canvas) {
-    if (!this.isAdding || pressed.button !== 0 || this.history.isOn) return false;
+    if (!this.isAdding || pressed.target !== canvas || pressed.button !== 0 || this.history.isOn) return false;
     const box = this.stage.getBoundingClientRect();
     const put = ({ clientX, clientY }) => this.history.move((before) => {
       const scale = before.camera.width / box.width;

@@ -110,7 +110,8 @@ export class View {
   #follow(event, isPanning) {
     this.#isPanning = isPanning;
     this.#fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    event.target.setPointerCapture(event.pointerId);
+    // What else follows a pointer has captured it, and would not hear that it is released.
+    if (isPanning) event.target.setPointerCapture(event.pointerId);
   }
 
   #move(event) {
