@@ -25,6 +25,7 @@ export function fromPolar(before, { ahead, right }) {
 const posed = (change) => (before, value) => withCamera(before, before.camera, { ...before.stance, ...change(value) });
 
 // Each field: its range, how it is read from a state and what it makes of one; `name` is read aloud.
+// What is typed may exceed the slider's where that is logarithmic, wraps or is open.
 function described(start, lighting, lamps) {
   const lit = (name) => ({
     get: (now) => lighting.shown(now)[name],
@@ -39,13 +40,13 @@ function described(start, lighting, lamps) {
       size: { label: 'Size', name: 'Size', unit: 'm', low: size / 100, high: size * 100, log: true, get: (now) => now.size, set: (before, metres) => ({ ...before, size: metres }) },
       turn: { label: 'Turn', name: 'Turn', unit: '°', low: -180, high: 180, digits: 1, wrap: true, get: (now) => wrapped(now.turn), set: (before, turn) => ({ ...before, turn }) },
       ahead: { label: 'Ahead', name: 'Metres ahead', unit: 'm', low: 0.3 * height, high: 60 * height, log: true, get: (now) => polar(now).ahead, set: (before, ahead) => fromPolar(before, { ...polar(before), ahead }) },
-      right: { label: 'Right', name: 'Metres to the right', unit: 'm', low: -10 * height, high: 10 * height, digits: 2, get: (now) => polar(now).right, set: (before, right) => fromPolar(before, { ...polar(before), right }) },
+      right: { label: 'Right', name: 'Metres to the right', unit: 'm', low: -10 * height, high: 10 * height, isOpen: true, digits: 2, get: (now) => polar(now).right, set: (before, right) => fromPolar(before, { ...polar(before), right }) },
     },
     camera: {
       pitch: { label: 'Pitch', name: 'Pitch, up is positive', unit: '°', low: -STEEPEST, high: STEEPEST, digits: 2, get: (now) => now.stance.pitch, set: posed((pitch) => ({ pitch })) },
       roll: { label: 'Roll', name: 'Roll', unit: '°', low: -45, high: 45, digits: 2, get: (now) => now.stance.roll, set: posed((roll) => ({ roll })) },
       fov: {
-        label: 'View', name: 'Horizontal field of view', unit: '°', low: 6, high: 140, digits: 1, get: (now) => fieldOfView(now.camera),
+        label: 'View', name: 'Horizontal field of view', unit: '°', low: 3, high: 168, digits: 1, get: (now) => fieldOfView(now.camera),
         set: (before, fov) => {
           const { camera, stance } = zoomed(before.camera, before.stance, focalLength(before.camera, fov));
           return withCamera(before, camera, stance);
@@ -73,9 +74,19 @@ function made(tag, attributes) {
   return Object.assign(document.createElement(tag), attributes);
 }
 
+// Why a field does not take what was typed; empty where it does, or where nothing was.
+function refusal({ entry, name, unit, low, high, log, wrap, isOpen }) {
+  const typed = entry.valueAsNumber;
+  const expects = (what) => `${name}: expected ${what}${Number.isNaN(typed) ? '' : ` (found ${typed})`}.`;
+  if (entry.validity.badInput) return expects('a number');
+  if (log) return typed <= 0 ? expects('more than 0') : '';
+  return !wrap && !isOpen && (typed < low || typed > high) ? expects(`${plain(low, 2)} to ${plain(high, 2)} ${unit}`) : '';
+}
+
 export class Fields {
-  constructor(start, lighting, lamps, history) {
-    Object.assign(this, { start, history });
+  // `tell` shows a problem, or none where its words are empty.
+  constructor(start, lighting, lamps, history, tell) {
+    Object.assign(this, { start, history, tell });
     const groups = described(start, lighting, lamps);
     this.byName = Object.assign({}, ...Object.values(groups));
     for (const [group, members] of Object.entries(groups)) {
@@ -100,8 +111,9 @@ export class Fields {
     entry.addEventListener('change', () => {
       field.isTyped = false;
       const typed = entry.valueAsNumber;
-      const isGood = Number.isFinite(typed) && (!log || typed > 0) && (log || field.wrap || (typed >= low && typed <= high));
-      if (isGood) this.history.once(`${name} typed`, (before) => field.set(before, typed));
+      const problem = refusal(field);
+      this.tell(problem);
+      if (Number.isFinite(typed) && !problem) this.history.once(`${name} typed`, (before) => field.set(before, typed));
       // What was refused, and what changed nothing, is shown as it was.
       this.show(this.history.state);
     });

@@ -46,6 +46,11 @@ async function image(address) {
   return loaded;
 }
 
+function tell(problem) {
+  $('problem').textContent = problem;
+  $('problem').hidden = !problem;
+}
+
 // The stage, or why there is none: without it nothing here can be used.
 function drawn() {
   try {
@@ -67,7 +72,7 @@ const lamps = new Lamps($('handles'), $('stage'), history, lighting, {
   toggle: $('add-lamp'), options: $('lamp-options'), which: $('lamp-which'), remove: $('remove-lamp'), words: $('lamp-words'), chosen: draw,
   added: (now) => now.lamps.length === 1 && warm(now), // the kernels for lamps
 });
-const fields = new Fields(start, lighting, lamps, history);
+const fields = new Fields(start, lighting, lamps, history, tell);
 const dial = new Dial($('dial'), lighting, history);
 const lines = new Lines($('handles'), $('stage'), history, {
   toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
@@ -270,6 +275,12 @@ window.addEventListener('keydown', (event) => {
   $('readout').hidden = false;
   event.preventDefault();
 });
+// Half of the world writes 1,5: a number's field may leave the comma out, and make 15 of it.
+window.addEventListener('beforeinput', (event) => {
+  if (event.target.type !== 'number' || !event.data?.includes(',')) return;
+  event.preventDefault();
+  document.execCommand('insertText', false, event.data.replaceAll(',', '.'));
+});
 window.addEventListener('keyup', () => {
   $('readout').hidden = true;
 });
@@ -328,13 +339,13 @@ async function save() {
   const sent = state;
   $('save').disabled = true;
   $('command').textContent = '';
-  $('problem').hidden = $('done').hidden = true;
+  tell('');
+  $('done').hidden = true;
   try {
     const { command } = await post('save', sentPlacement(sent));
     showSaved(sent, command);
   } catch (error) {
-    $('problem').textContent = `Not saved: ${error.message}`;
-    $('problem').hidden = false;
+    tell(`Not saved: ${error.message}`);
   }
   $('save').disabled = false;
 }
