@@ -4,8 +4,44 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.programs.browser import needs_chromium
-from tests.builders.programs.placing import STATE, command, enter, placing, press
+from tests.builders.programs.browser import Opened, needs_chromium
+from tests.builders.programs.placing import (
+    HEIGHT,
+    STATE,
+    WIDTH,
+    command,
+    enter,
+    placing,
+    press,
+)
+from tests.place.test_lamps import SEEN
+
+
+def focused(opened: Opened) -> str:
+    """Name of the handle, or id of the element, that has the focus."""
+    code = "(({ dataset, id, tagName }) => dataset.handle ?? (id || tagName))"
+    name: str = opened.page.evaluate(f"{code}(document.activeElement)")
+    return name
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_lamp_is_added_moved_and_removed(inputs: Path, tmp_path: Path) -> None:
+    """It hangs in the upper middle, its knob has the focus, and that is never lost."""
+    with placing(command(inputs, tmp_path / "out")) as opened:
+        opened.page.focus("#add-lamp")
+        press(opened, "Enter")
+        assert opened.page.evaluate(SEEN)[0] == pytest.approx([WIDTH / 2, HEIGHT / 4])
+        assert focused(opened) == "lamp0"
+        press(opened, "Shift+ArrowLeft", "ArrowUp")
+        assert opened.page.evaluate(SEEN)[0] == pytest.approx([WIDTH / 2 - 10, HEIGHT / 4 - 1])
+        press(opened, "Delete")
+        assert opened.page.evaluate(STATE)["lamps"] == []
+        assert focused(opened) == "add-lamp"
+        press(opened, "Enter")
+        opened.page.focus("#remove-lamp")
+        press(opened, "Enter")
+        assert focused(opened) == "add-lamp"
 
 
 @needs_chromium

@@ -61,7 +61,7 @@ export class Lamps {
   constructor(svg, stage, history, lighting, page) {
     Object.assign(this, { stage, history, lighting, page });
     this.group = svg.appendChild(shape('g', { class: 'lamps' }));
-    page.toggle.addEventListener('click', () => this.#turn(!this.isAdding));
+    page.toggle.addEventListener('click', ({ detail }) => (detail || this.isAdding ? this.#turn(!this.isAdding) : this.#hang()));
     page.which.addEventListener('change', () => this.#choose(Number(page.which.value)));
     page.remove.addEventListener('click', () => this.#remove(this.#chosen));
   }
@@ -83,6 +83,19 @@ export class Lamps {
 
   #remove(index) {
     this.history.once('lamp removed', (before) => ({ ...before, lamps: before.lamps.filter((_, k) => k !== index) }));
+    if (!this.history.state.lamps[index]) this.page.toggle.focus(); // what had the focus is gone
+  }
+
+  // A key clicks nowhere: its lamp hangs in the photo's upper middle, and arrows move it from there.
+  #hang() {
+    const count = this.history.state.lamps.length;
+    this.#chosen = count;
+    this.history.once('lamp', (before) => {
+      const { width, height } = before.camera;
+      return { ...before, lamps: [...before.lamps, lampAt(before, [width / 2, height / 4], this.lighting)] };
+    });
+    this.page.added(this.history.state);
+    requestAnimationFrame(() => this.#marks[count].knob.focus());
   }
 
   // The lamp that the fields are about, if any.
