@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.builders.programs.browser import Opened, needs_chromium
@@ -42,6 +43,57 @@ def test_lamp_is_added_moved_and_removed(inputs: Path, tmp_path: Path) -> None:
         opened.page.focus("#remove-lamp")
         press(opened, "Enter")
         assert focused(opened) == "add-lamp"
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_focus_stays_while_something_is_made(inputs: Path, tmp_path: Path) -> None:
+    """On Save, on Render here, and there again after Cancel; seconds are not read aloud."""
+    said = {"state": "running", "kind": "preview", "line": "picture", "share": 0.5, "seconds": 3}
+    with placing(command(inputs, tmp_path / "out")) as opened:
+        page = opened.page
+        page.focus("#save")
+        press(opened, "Enter")
+        page.wait_for_selector("#done:not([hidden])")
+        assert focused(opened) == "save"
+        page.route("**/preview", lambda route: route.fulfill(json={}))
+        page.route("**/progress.json", lambda route: route.fulfill(json=said))
+        page.focus("#preview")
+        press(opened, "Enter")
+        page.wait_for_selector("#clock:has-text('3 s')")
+        press(opened, "Enter")
+        assert page.inner_text("[role=status]:has-text('Rendering')") == "Rendering …"
+        assert focused(opened) == "preview"
+        page.focus("#stage")
+        press(opened, "q")
+        page.focus("#cancel")
+        said |= {"state": "done", "address": "photo.jpg"}
+        page.wait_for_selector("#rendering-words:has-text('Undo shows it')")
+        assert focused(opened) == "preview"
+        assert page.is_hidden("#picture")
+        press(opened, "Control+z")
+        page.wait_for_selector("#picture:not([hidden])")
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_estimated_light_can_be_read(inputs: Path, tmp_path: Path) -> None:
+    """What is written of it has WCAG's contrast of 4.5 on the panel; nothing dims it."""
+    seen = """(element) => {
+      let opacity = 1;
+      for (let e = element; e; e = e.parentElement) opacity *= getComputedStyle(e).opacity;
+      return [opacity, getComputedStyle(element).color];
+    }"""
+    with placing(command(inputs, tmp_path / "out")) as opened:
+        page = opened.page
+        page.wait_for_selector("#light:not([data-source=own])")
+        for name in ("label", ".unit", "input[type=number]", "select"):
+            opacity, color = page.locator(f"#light-fields {name}").first.evaluate(seen)
+            assert opacity == 1.0, name
+            codes = [float(part) / 255.0 for part in color[4:-1].split(",")]
+            linear = [((part + 0.055) / 1.055) ** 2.4 for part in codes]
+            luminance = np.dot(linear, [0.2126, 0.7152, 0.0722])
+            assert (0.95 + 0.05) / (luminance + 0.05) > 4.5, name
 
 
 @needs_chromium

@@ -87,7 +87,7 @@ const mask = new Mask({
 }, $('photo'), start.has_mask ? await image('mask.png') : null, start.photo, history, $('stage'));
 const pictures = new Pictures({
   preview: $('preview'), insert: $('insert'), cancel: $('cancel'), picture: $('picture'), bar: $('bar'),
-  words: $('rendering-words'), report: $('report'),
+  words: $('rendering-words'), clock: $('clock'), report: $('report'),
 }, {
   get state() {
     return state;
@@ -327,6 +327,7 @@ function warm(now) {
 }
 
 let saved = state;
+let isSaving = false; // the button is not disabled then: it would lose the focus
 
 function showSaved(sent, command) {
   $('command').textContent = command;
@@ -335,9 +336,9 @@ function showSaved(sent, command) {
 }
 
 async function save() {
-  if ($('save').disabled) return;
+  if ($('save').disabled || isSaving) return;
   const sent = state;
-  $('save').disabled = true;
+  isSaving = true;
   $('command').textContent = '';
   tell('');
   $('done').hidden = true;
@@ -347,7 +348,7 @@ async function save() {
   } catch (error) {
     tell(`Not saved: ${error.message}`);
   }
-  $('save').disabled = false;
+  isSaving = false;
 }
 
 // A page that is loaded again, also by a browser that was short of memory, goes on where it was, by

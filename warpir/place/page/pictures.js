@@ -7,7 +7,7 @@ export class Pictures {
   #polls = false;
   #asked = null; // the state whose preview this page waits for
 
-  // `elements` has preview, insert, cancel, picture, bar, words, report; `page` has state,
+  // `elements` has preview, insert, cancel, picture, bar, words, clock, report; `page` has state,
   // placement(state), ask(address), post(address, values), saved(state, command).
   constructor(elements, page) {
     Object.assign(this, elements, { page });
@@ -24,6 +24,7 @@ export class Pictures {
   }
 
   async #begin(kind) {
+    if (!this.bar.hidden) return; // one at a time; the button is not disabled: it would lose the focus
     const { state } = this.page;
     this.report.hidden = true;
     this.#show({ state: 'running', kind, line: 'starting', share: null, seconds: 0 });
@@ -66,23 +67,31 @@ export class Pictures {
 
   #show({ state, kind, line, share, seconds, problem, address }) {
     const isRunning = state === 'running';
+    if (!isRunning && document.activeElement === this.cancel) this.preview.focus();
     this.bar.hidden = this.cancel.hidden = !isRunning;
-    this.preview.disabled = this.insert.disabled = isRunning;
+    for (const button of [this.preview, this.insert]) button.setAttribute('aria-disabled', isRunning);
     if (share === null || share === undefined) this.bar.removeAttribute('value');
     else this.bar.value = share;
     this.words.classList.toggle('warn', state === 'failed');
-    if (isRunning) this.words.textContent = `${STAGES[line] ?? line} … ${Math.round(seconds)} s`;
-    else if (state === 'failed') this.words.textContent = problem;
-    else if (state === 'cancelled') this.words.textContent = 'Cancelled.';
+    if (isRunning) this.#say(`${STAGES[line] ?? line} …`, ` ${Math.round(seconds)} s`);
+    else if (state === 'failed') this.#say(problem);
+    else if (state === 'cancelled') this.#say('Cancelled.');
     else if (kind === 'insert') {
-      this.words.textContent = `Inserted in ${seconds} s. `;
+      this.#say(`Inserted in ${seconds} s. `);
       this.report.href = address;
       this.report.hidden = false;
     } else if (this.#asked) {
-      this.words.textContent = `Preview, ${seconds} s: the composite at low quality. Any change hides it.`;
+      const isNow = this.#asked === this.page.state;
+      this.#say(`Preview, ${seconds} s: the composite at low quality${isNow ? '. Any change hides it.' : ' before your last change. Undo shows it.'}`);
       this.of = this.#asked;
       this.picture.src = address;
       this.picture.decode().then(() => this.draw(this.page.state), () => {});
-    } else this.words.textContent = ''; // of another page
+    } else this.#say(''); // of another page
+  }
+
+  // Words that a screen reader says once, and a clock that it leaves alone.
+  #say(words, clock = '') {
+    if (this.words.textContent !== words) this.words.textContent = words;
+    this.clock.textContent = clock;
   }
 }
