@@ -80,6 +80,13 @@ def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path
                 assert not (left < x < right and top < y < bottom), (name, place)
             three = [np.array(knobs[name]) for name in ("size", "turn", "foot")]
             assert min(np.linalg.norm(a - b) for a, b in pairwise(three)) > 35.0
+        # Nor does one lie on that of the field of view, where the object reaches to the horizon.
+        for size, ahead in (("3.3", "9.3"), ("4", "9.3"), ("4", "12")):
+            enter(opened, "size", size)
+            enter(opened, "ahead", ahead)
+            fov = np.array(handle_at(opened, "fov"))
+            for name in ("size", "turn", "foot"):
+                assert np.linalg.norm(fov - handle_at(opened, name)) > 24.0, (name, size)
         before = page.evaluate(STATE)
         drag(opened, "turn", (20.0, 0.0))
         turned = page.evaluate(STATE)

@@ -276,7 +276,7 @@ export class Handles {
     put('tilt', level(0.06));
     put('roll', level(0.94));
     const { foot, onRing } = this.#drawRing(state, draw, onStage);
-    if (this.isBeside) this.#putBeside(put, low, high);
+    if (this.isBeside) this.#putBeside(put, state, low, high);
     else this.#putAround(put, state, onStage(foot), onStage(onRing), onStage);
   }
 
@@ -310,12 +310,14 @@ export class Handles {
     put('size', top && lowestFirst.reduce(above, [top[0], top[1] - 30]));
   }
 
-  // In a column to the object's right, or to its left where there is no room.
-  #putBeside(put, low, high) {
+  // In a column to the object's right, or to its left where there is no room; below the horizon and
+  // what lies on it.
+  #putBeside(put, { camera, stance }, low, high) {
     const [left, top, right, bottom] = this.bounds.map((part) => part * this.scale);
     const x = right + BESIDE <= high[0] || left - BESIDE < low[0] ? right + BESIDE : left - BESIDE;
     const step = 42;
-    const middle = clamp((top + bottom) / 2, low[1] + step, high[1] - step);
+    const highest = horizonRow(camera, stance, x / this.scale) * this.scale + APART + step;
+    const middle = clamp(Math.max((top + bottom) / 2, highest), low[1] + step, high[1] - step);
     for (const [k, name] of ['size', 'turn', 'foot'].entries()) put(name, [x, middle + (k - 1) * step]);
   }
 
