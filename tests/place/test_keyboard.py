@@ -1,9 +1,11 @@
 """The placing page by keyboard alone."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.builders.programs.browser import Opened, needs_chromium
 from tests.builders.programs.placing import (
@@ -14,6 +16,7 @@ from tests.builders.programs.placing import (
     enter,
     placing,
     press,
+    settle,
 )
 from tests.place.test_lamps import SEEN
 
@@ -94,6 +97,21 @@ def test_estimated_light_can_be_read(inputs: Path, tmp_path: Path) -> None:
             linear = [((part + 0.055) / 1.055) ** 2.4 for part in codes]
             luminance = np.dot(linear, [0.2126, 0.7152, 0.0722])
             assert (0.95 + 0.05) / (luminance + 0.05) > 4.5, name
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "around"), [("stage", "#room"), ("zoom-in", "#zoom-in")])
+def test_focus_on_the_photo_is_seen(inputs: Path, tmp_path: Path, name: str, around: str) -> None:
+    """A white frame is drawn where what lies in it and over it does not hide it."""
+    with placing(command(inputs, tmp_path / "out"), 700, 500) as opened:
+        press(opened, "Tab")
+        opened.page.focus(f"#{name}")
+        settle(opened)
+        picture = Image.open(BytesIO(opened.page.locator(around).screenshot())).convert("RGB")
+        white = (np.asarray(picture) == 255).all(axis=-1)
+        middle = white.shape[0] // 2
+        assert white[middle, :8].sum() == white[middle, -8:].sum() == 2
 
 
 @needs_chromium
