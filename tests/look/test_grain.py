@@ -8,7 +8,7 @@ import pytest
 from warpir.core.arrays import Float64Array
 from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
 from warpir.look.camera_look import estimate_look
-from warpir.look.grain import Grain, as_told, estimate_grain, grain_over
+from warpir.look.grain import EXCESS, Grain, as_told, estimate_grain, grain_over
 from warpir.look.texture import Texture
 
 
@@ -66,8 +66,14 @@ def test_texture_decides_the_strength() -> None:
     posterised = replace(
         flat, level=(0.2, 0.4, 0.8), strength=((0.01,) * 3, (0.0,) * 3, (0.01,) * 3)
     )
-    told = as_told(posterised, 0.02 * flat.luminance_share)
+    told = as_told(posterised, 0.02 * flat.luminance_share, is_recoded=True)
     assert told is not None and np.max(told.strength) == pytest.approx(0.02)
+    # Flat patches show what a file has, but not what its coding took.
+    most = 0.02 * flat.luminance_share
+    told = as_told(flat, 2.0 * most)
+    assert told is not None and told.of_luminance == pytest.approx(EXCESS * most)
+    told = as_told(flat, 2.0 * most, is_recoded=True)
+    assert told is not None and told.of_luminance == pytest.approx(2.0 * most)
     for is_grey in (False, True):
         alone = as_told(None, 0.012, is_grey)
         assert alone is not None and alone.of_luminance == pytest.approx(0.012)

@@ -222,7 +222,8 @@ def estimate_look(
         if grain == "auto":
             flat, told = estimate_grain(srgb), texture.result().grain
             is_grey = bool((srgb == srgb[..., :1]).all())
-            look = replace(look, grain=flat if told is None else as_told(flat, told, is_grey))
+            own = flat if told is None else as_told(flat, told, is_grey, jpeg is not None)
+            look = replace(look, grain=own)
     if sharpness == "auto":
         look = replace(look, blur=blur.result())
     elif sharpness != "off":

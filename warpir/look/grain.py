@@ -43,7 +43,8 @@ LEAST = 0.4 / 255.0
 has .29 codes."""
 EXCESS = 1.3
 """Strength of a level over the weakest quarter of levels [1], beyond which it is taken for texture:
-the noise of a sensor changes little over the display values of a picture."""
+the noise of a sensor changes little over the display values of a picture. Also of what the texture
+tells over flat patches (`as_told`)."""
 WIDEST = 2.0
 """Largest standard deviation of the blur that stands for the grain's size [px]."""
 HEAVY = (3.0 / 255.0, 10.0 / 255.0)
@@ -175,23 +176,32 @@ def _patches(srgb: AnyFloatArray) -> AnyFloatArray:
     return tiles.transpose(0, 2, 1, 3, 4).reshape(-1, SIDE, SIDE, 3)
 
 
-def as_told(grain: Grain | None, luminance: float, is_grey: bool = False) -> Grain | None:
+def as_told(
+    grain: Grain | None, luminance: float, is_grey: bool = False, is_recoded: bool = False
+) -> Grain | None:
     """Return a grain with the strength that the texture tells, or None below `LEAST`.
+
+    Flat patches show all the grain of a file, and perhaps texture. So more than they show, by
+    `EXCESS`, is sharpened texture or was there before the file was coded, and counts only where
+    that is repeated.
 
     Args:
         grain: That of flat patches, whose levels, channels and size are kept, its median level
             at the strength, but for one beyond `HEAVY`; None: without any.
         luminance: Standard deviation of the luminance [1].
         is_grey: Whether the photo's channels are equal, and so is what is not known of its grain.
+        is_recoded: Whether `blocks_over` comes after it, and takes off what the file's coding did.
     """
-    if luminance < LEAST:
-        return None
     if grain and luminance > HEAVY[0] and grain.of_luminance > HEAVY[1]:
         return grain
     found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, float(is_grey))
     # Not that in the middle of the range, where a posterised picture may have none.
-    median = float(np.median(np.mean(found.strength, axis=1)))
-    times = luminance / (median * found.luminance_share)
+    median = float(np.median(np.mean(found.strength, axis=1))) * found.luminance_share
+    if grain is not None and not is_recoded:
+        luminance = min(luminance, EXCESS * median)
+    if luminance < LEAST:
+        return None
+    times = luminance / median
     told = tuple((times * r, times * g, times * b) for r, g, b in found.strength)
     return replace(found, strength=told)
 
