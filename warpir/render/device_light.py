@@ -299,7 +299,7 @@ def _cumulated(
 def _row_table(row: Float64Array) -> FloatArray:
     """Return the cumulated probabilities of rows by their sums, shape [He + 1]."""
     cdf = np.concatenate([[0.0], np.cumsum(row) / max(row.sum(), 1e-300)])
-    table = np.minimum(cdf, 1.0).astype(np.float32)
+    table: FloatArray = np.minimum(cdf, 1.0).astype(np.float32)
     table[-1] = 1.0
     return table
 

@@ -197,9 +197,8 @@ def read_photo(
     if codes.dtype.kind == "f":
         with np.errstate(over="ignore", invalid="ignore"):  # counted below
             plate = _to_rec709(codes.astype(np.float32, copy=False), image, notices)
-        plate = _finite(path, plate, strict, notices)
+        codes = plate = _finite(path, plate, strict, notices)
         notices.append(_about_plate(plate))
-        codes = plate
         srgb: FloatArray = np.clip(color.linear_to_gamma(plate), 0.0, 1.0)
     else:
         codes, srgb, icc = _to_srgb(path, codes, image, notices)
