@@ -155,9 +155,9 @@ def mirror_direction(device: str, cos_o: float) -> Measured:
 
 
 def albedo(device: str, roughness: float, cos_o: float) -> Measured:
-    """Mean weight of a rough coat, against quadrature over its half vectors."""
+    """Mean weight of a rough coat, against quadrature."""
     weight, wi = coat(device, toward(cos_o), roughness**2, DRAWS)
-    truth = o.coat_albedo(cos_o, roughness**2)
+    truth = o.reflected_share(cos_o, roughness**2, o.fresnel)
     return Measured(abs(float(weight.mean()) / truth - 1.0), finite(weight, wi))
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 CASES = (*(f"G{k}" for k in range(1, 30)), *(f"M{k}" for k in range(1, 23)))
-TESTS = ("gltf", "obj", "placement", "render", "command", "faults")
+TESTS = ("gltf", "obj", "placement", "render", "command", "faults", "limits")
 """Where the tests of the cases are."""
 
 

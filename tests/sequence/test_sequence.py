@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -29,6 +29,14 @@ FRAMES: list[dict[str, Any]] = [
     {"photo": "deep.png", "at": "24,24", "size": 0.8, "exposure": -1, "seed": 5},
 ]
 """Nothing changed; another object and pose; another photo, and --at in place of --place."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_ffmpeg(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Frames have no video here, whatever is installed; ``test_video.py`` has its tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path_factory.mktemp("empty")))
+        yield
 
 
 @pytest.fixture(scope="module")
