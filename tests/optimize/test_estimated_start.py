@@ -76,7 +76,7 @@ def test_default_run_is_the_estimated_light(
 ) -> None:
     """No model is asked; the light is that of --guidance none with a model at hand."""
     out, alone = tmp_path / "out", tmp_path / "alone"
-    flags = argv(folder, out, **UNGUIDED)
+    flags = argv(folder, out, **UNGUIDED, device="cpu")
     assert main([*flags, "--validate"]) == ExitCode.DONE
     assert main(flags) == ExitCode.DONE
     said = capsys.readouterr().out
@@ -85,7 +85,8 @@ def test_default_run_is_the_estimated_light(
     assert f"light regressed from the photo, +- {spread:.0f} degrees" in said
     assert measured["prior"] == "none" and "acceptance" not in measured
     assert [p.name for p in (out / "progress").iterdir()] == ["preview-000000.png"]
-    assert main(argv(folder, alone, guidance="none", preview_every="0")) == ExitCode.DONE
+    more = {"guidance": "none", "preview_every": "0", "device": "cpu"}
+    assert main(argv(folder, alone, **more)) == ExitCode.DONE
     assert not (alone / "progress").exists()
     for name in ("lobes.json", "curves.json", "envmap.exr", "composite.png"):
         assert digest(out)[name] == digest(alone)[name]
@@ -94,7 +95,8 @@ def test_default_run_is_the_estimated_light(
 def test_preview_is_the_result_in_small(folder: Path, tmp_path: Path) -> None:
     """A grainy picture of the photo's size under the same light, written before the result."""
     out = tmp_path / "out"
-    assert main(argv(folder, out, **{**UNGUIDED, "samples": "64"})) == ExitCode.DONE
+    flags = argv(folder, out, **UNGUIDED, samples="64", device="cpu")
+    assert main(flags) == ExitCode.DONE
     shown, result = (
         read_photo(path).srgb
         for path in (out / "progress" / "preview-000000.png", out / "composite.png")
@@ -114,7 +116,7 @@ def test_guided_run_says_where_it_began(
     """Estimate, model and verdict: report and output name all three."""
     judged_as(monkeypatch, True)
     out = tmp_path / "out"
-    assert main(argv(folder, out, accept="")) == ExitCode.DONE
+    assert main(argv(folder, out, accept="", device="cpu")) == ExitCode.DONE
     said = capsys.readouterr().out
     assert "summary: prior stable-diffusion (sha256" in said
     assert "its end accepted; light regressed from the photo, +- " in said
