@@ -368,6 +368,7 @@ def test_command_reads_values(argv: list[str], name: str, value: object) -> None
         (["--photo"], "--photo", "expected one argument"),
         (["--overwrite=yes"], "--overwrite", "ignored explicit argument"),
         (["--lamp", "0,1,-1,0.1,5", "--lamp", "1,1,-1,0.1,5"], "--lamp", "given twice"),
+        (["--asset", "b.glb"], "--asset", "given twice: a run inserts one object"),
         (["stray"], "stray", "no such flag"),
         (["--sample", "4"], "--sample", "no such flag"),
     ],
@@ -748,7 +749,11 @@ def test_command_refuses_inputs_that_a_result_could_replace(
     (tmp_path / "a.obj").write_text("mtllib out/a.mtl\nusemtl red\n" + OBJ)
     if target is not None:
         (tmp_path / name).symlink_to(tmp_path / target)
-    argv = [*scene, "--overwrite", flag, str(tmp_path / name)]
+    if flag in scene:
+        scene[scene.index(flag) + 1] = str(tmp_path / name)
+    else:
+        scene += [flag, str(tmp_path / name)]
+    argv = [*scene, "--overwrite"]
     argv += ["--prompt", "p"] if flag == "--model" else []
     with pytest.raises(InputError, match="--out: holds the input") as caught:
         read_inputs(parse(argv).config)

@@ -59,6 +59,11 @@ BY_HAND = tuple(name for name, option in OPTIONS.items() if option.rule.by_hand)
 SEPARATORS = {name: option.rule.separator for name, option in OPTIONS.items()}
 """What parts the texts of a list, where they may hold commas."""
 
+SEVERAL = {
+    "asset": "a run inserts one object; join them in one file, or insert one after the other",
+    "lamp": "--lamps FILE lists several lamps",
+}
+"""What to do for several of what a flag names."""
 USAGE = "python -m warpir.insert --photo FILE --asset FILE --out DIR [FLAG ...]"
 DESCRIPTION = "Put a 3D object into a photograph so that it looks as if it had stood there."
 EXAMPLES = """\
@@ -202,14 +207,14 @@ class Parser(argparse.ArgumentParser):
         return super().format_help()
 
 
-class _OneLamp(argparse.Action):
-    """Keep the text of --lamp; of several the last one would count, without a word."""
+class _Once(argparse.Action):
+    """Keep the text of a flag of `SEVERAL`; the last one would count, without a word."""
 
     def __call__(
         self, _: argparse.ArgumentParser, given: argparse.Namespace, text: Any, *rest: Any
     ) -> None:
         if hasattr(given, self.dest):
-            raise argparse.ArgumentError(self, "given twice: --lamps FILE lists several lamps")
+            raise argparse.ArgumentError(self, f"given twice: {SEVERAL[self.dest]}")
         setattr(given, self.dest, text)
 
 
@@ -263,7 +268,7 @@ def make_parser(
                     flag(name), dest=name, nargs="?", const=True, metavar=form.strip("[]")
                 )
             elif form:
-                keep = _OneLamp if name == "lamp" else "store"
+                keep = _Once if name in SEVERAL else "store"
                 group.add_argument(flag(name), dest=name, metavar=form, action=keep)
             else:
                 action = "store_false" if DEFAULTS[name] else "store_true"
