@@ -836,6 +836,7 @@ def test_flags_that_guidance_does_not_read_are_said(read: str, why: str, unread:
     assert {*line.partition(": ")[2].split(", ")} == flags
 
 
+@pytest.mark.case("M16")
 @pytest.mark.parametrize("axis", [None, "y", "+z", "-z"])
 def test_M16_asset_up_is_applied_and_said(scene: list[str], axis: str | None) -> None:
     """Without --asset-up an OBJ is taken as Y up; with another axis it is turned; both are said."""
