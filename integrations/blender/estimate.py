@@ -41,16 +41,21 @@ def write_grain(result: Path, path: Path) -> None:
     import numpy as np
     from PIL import Image
 
+    from warpir.app.finished import config_of_record
+    from warpir.app.inputs import read_photo_of
+    from warpir.core.color import GAMMA
     from warpir.io.images.writers import exr_bytes
     from warpir.look.grain import Grain
 
     record = json.loads((result / "run.json").read_text("utf-8"))
     if (found := record["measured"]["look"]["grain"]) is None:
         return
-    grain = Grain(**found)
+    grain, config = Grain(**found), config_of_record(record["config"])
+    # It is that of a linear plate as it is exposed; Blender shows the plate as it is.
+    alpha = read_photo_of(config.inputs, config.limits).exposure ** (1.0 / GAMMA)
     with Image.open(result / "photo.png") as picture:
         display = np.asarray(picture.convert("RGB"), np.float64) / 255.0
-    noise = grain.deviation(display) * grain.draw(display.shape[:2], 0)
+    noise = grain.deviation(alpha * display) / alpha * grain.draw(display.shape[:2], 0)
     path.write_bytes(exr_bytes(path, {c: noise[..., k].astype("f4") for k, c in enumerate("RGB")}))
 
 

@@ -13,6 +13,7 @@ import sys
 import time
 import tomllib
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -24,10 +25,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import warpir.demo
+from tests.builders.image_files import write_image
 from tests.io.test_handoff import BLENDER, planes_of, stacked
 from warpir.core.color import linear_to_srgb
 from warpir.io.cameras.reader import read_camera
 from warpir.io.export import tone_curve_cube
+from warpir.io.images.decoder import decode_image
+from warpir.look.grain import Grain
 from warpir.look.response import Response
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -136,6 +140,23 @@ def test_a_photo_upside_down_is_known(tmp_path: Path) -> None:
     Image.new("RGB", (48, 32)).save(tmp_path / "upright.jpg")
     assert estimate["is_turned"](str(tmp_path / "turned.jpg"))
     assert not estimate["is_turned"](str(tmp_path / "upright.jpg"))
+
+
+def test_grain_of_a_plate_is_as_strong_as_the_plate_is_shown(tmp_path: Path) -> None:
+    """It is recorded for the plate as it is exposed, and Blender shows the plate as it is."""
+    estimate = runpy.run_path(str(FOLDER / "estimate.py"))
+    shown = np.tile(np.linspace(0.1, 1.0, 64), (48, 1))[..., None].repeat(3, axis=-1)
+    look = {"grain": asdict(Grain((0.5,), ((0.02,) * 3,), 0.0, 0.0))}
+    strengths = []
+    for factor in (1.0, 0.1):
+        plate = write_image(tmp_path / "p.exr", (factor * shown**2.2).astype(np.float32))
+        record = {"config": {"photo": str(plate)}, "measured": {"look": look}}
+        (tmp_path / "run.json").write_text(json.dumps(record), "utf-8")
+        display = shown * factor ** (1.0 / 2.2)
+        Image.fromarray(np.uint8(255.0 * display)).save(tmp_path / "photo.png")
+        estimate["write_grain"](tmp_path, tmp_path / "grain.exr")
+        strengths.append(decode_image(tmp_path / "grain.exr", 10**6).pixels.std())
+    assert strengths[1] == pytest.approx(strengths[0] * 0.1 ** (1.0 / 2.2), rel=1e-3)
 
 
 def test_flags_go_to_their_own_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
