@@ -203,3 +203,7 @@ def test_a_large_panorama_is_read_once_and_shrunk(tmp_path: Path, monkeypatch) -
         np.testing.assert_allclose(light.irradiance(up), given.irradiance(up), rtol=1e-3)
         np.testing.assert_array_equal(light.texels, resize_map(given.texels, 512))
     assert len(reads) == 1
+    write_image(path, texels[::2, ::2] + np.float32(1.0))
+    light = loaders.light(asked, False, np.eye(4), Limits(), Log())
+    given = read_light(asked, False, np.eye(4), Limits(), Log())
+    np.testing.assert_array_equal(light.texels, given.texels)  # the file has changed

@@ -205,7 +205,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
 
     states: dict[str, tuple[Path, _State | None]] = {}
     with suppress(InputError):  # the reader tells
-        states = {name: (path, _state(path)) for name, path in input_files(config).items()}
+        states = {name: (path, file_state(path)) for name, path in input_files(config).items()}
     log, limits, inputs, given = Log(), config.limits, config.inputs, config.light
     for name, (path, state) in states.items():
         if state is not None and name in PICTURES:  # all of it is read for its sha256
@@ -237,7 +237,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
     hashes = {name: file_hash(path) for name, (path, _) in states.items()}
-    raise_all([_changed(path) for path, before in states.values() if _state(path) != before])
+    raise_all([_changed(path) for path, before in states.values() if file_state(path) != before])
     hashes |= _hashes_beside(config, asset, proxy)
     if run is not None:
         hashes["reuse"] = run.digest
@@ -381,7 +381,7 @@ PICTURES = ("photo", "occluder_mask", "shadow_mask", "light")
 _State = tuple[int, int, int]
 
 
-def _state(path: Path) -> _State | None:
+def file_state(path: Path) -> _State | None:
     """Return what a change of a file's content changes; None where there is no such file."""
     try:
         status = path.stat()

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import Inputs, Loaders, read_light, read_photo_of
+from warpir.app.inputs import Inputs, Loaders, file_state, read_light, read_photo_of
 from warpir.app.settings import InputConfig, LightConfig
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.latlong import resize_map
@@ -48,7 +48,7 @@ class Kept(Loaders):
         self._small: tuple[Photo, tuple[int, int], Photo] | None = None
         self._thin: tuple[InputConfig, Asset] | None = None
         self._light = lru_cache(maxsize=LIGHTS)(self._regression)
-        self._given: tuple[object, Light | None, list[str]] | None = None
+        self._given: tuple[object, Light, list[str]] | None = None
         self.light = self._small_light
 
     def shrunk(self, inputs: Inputs, width: int) -> Inputs:
@@ -90,19 +90,25 @@ class Kept(Loaders):
         limits: Limits,
         log: Log,
     ) -> Light | None:
-        """Return what --light holds, a large panorama made smaller, read once for all its turns."""
+        """Return what --light holds, a large panorama made smaller, read once for all its turns.
+
+        A file that has changed is read again, as the insertion will.
+        """
+        if (file := asked.file) is None:
+            return None
         asked, turn = replace(asked, rotate=0.0), asked.rotate
         axes = camera_to_world.tobytes() if asked.convention in IN_CAMERA_AXES else b""
-        key = asked.file, asked.convention, asked.fit_lobes, strict, limits, axes
+        key = file, file_state(Path(file)), asked.convention, asked.fit_lobes, strict, limits, axes
         if self._given is None or self._given[0] != key:
             about = Log()
             light = read_light(asked, strict, camera_to_world, limits, about)
-            if light is not None and light.texels is not None:
+            assert light is not None
+            if light.texels is not None:
                 rows = min(len(light.texels), LIGHT_ROWS)
                 light = Light(texels=resize_map(light.texels, rows))
             self._given = key, light, about.notices
         log.notice(*self._given[2])
-        return None if self._given[1] is None else self._given[1].rotated(turn)
+        return self._given[1].rotated(turn)
 
     def _regression(
         self,
