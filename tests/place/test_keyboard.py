@@ -148,3 +148,22 @@ def test_refused_number_is_told(inputs: Path, tmp_path: Path) -> None:
             enter(opened, field, typed)
             assert page.is_hidden("#problem")
             assert float(page.input_value(f"#{field}")) == float(typed)
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_refusal_stays_where_saving_follows_at_once(inputs: Path, tmp_path: Path) -> None:
+    """What is saved then is not what was typed; once something has changed, it is past."""
+    with placing(command(inputs, tmp_path / "out"), 700, 500) as opened:
+        page = opened.page
+        for save in (lambda: page.click("#save"), lambda: press(opened, "Control+s")):
+            page.focus("#pitch")
+            press(opened, "Control+a")
+            page.keyboard.type("95")
+            save()
+            page.wait_for_selector("#done", state="visible")
+            assert "(found 95)" in page.inner_text("#problem")
+            page.focus("#turn-slide")
+            press(opened, "ArrowRight", "Control+s")
+            page.wait_for_selector("#done", state="visible")
+            assert page.is_hidden("#problem")

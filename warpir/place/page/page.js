@@ -72,7 +72,11 @@ const lamps = new Lamps($('handles'), $('stage'), history, lighting, {
   toggle: $('add-lamp'), options: $('lamp-options'), which: $('lamp-which'), remove: $('remove-lamp'), words: $('lamp-words'), chosen: draw,
   added: (now) => now.lamps.length === 1 && warm(now), // the kernels for lamps
 });
-const fields = new Fields(start, lighting, lamps, history, tell);
+let refused = null; // the state in which a field has refused a number
+const fields = new Fields(start, lighting, lamps, history, (problem) => {
+  tell(problem);
+  refused = problem ? state : null;
+});
 const dial = new Dial($('dial'), lighting, history);
 const lines = new Lines($('handles'), $('stage'), history, {
   toggle: $('lines'), upright: $('upright'), options: $('axes'), words: $('lines-words'),
@@ -340,12 +344,13 @@ async function save() {
   const sent = state;
   isSaving = true;
   $('command').textContent = '';
-  tell('');
+  if (state !== refused) tell(''); // else what is saved is not what was typed
   $('done').hidden = true;
   try {
     const { command } = await post('save', sentPlacement(sent));
     showSaved(sent, command);
   } catch (error) {
+    refused = null;
     tell(`Not saved: ${error.message}`);
   }
   isSaving = false;
