@@ -299,9 +299,13 @@ def note(event):
     if event == {event!r} and count == {turn}:
         me = os.pidfd_open(os.getpid())
         if os.fork() == 0:  # not a thread: it would wait for the interpreter
-            time.sleep({delay})
-            signal.pidfd_send_signal(me, signal.SIGKILL)
-            os._exit(0)
+            os.closerange(0, me)  # the folder's lock too: it would outlive the run in this one
+            os.closerange(me + 1, 65536)
+            try:
+                time.sleep({delay})
+                signal.pidfd_send_signal(me, signal.SIGKILL)
+            finally:
+                os._exit(0)
     if event == "end" and {event!r}:
         time.sleep(10)  # a run that is faster than the measured one waits for its kill
 def mark(owner, name, event, after=None):
