@@ -167,9 +167,7 @@ def test_lamp_is_clicked_dragged_set_and_saved(inputs: Path, tmp_path: Path, wid
             settle(opened)
             assert page.evaluate(STATE) == after
         # A placement without lamps leaves none behind.
-        page.click("#save")
-        page.wait_for_selector("#save:not([disabled])")
-        settle(opened)
+        save(opened)
         assert "lamps" not in json.loads((out / "insert.json").read_text())
         assert not (out / "lamps.json").exists()
 

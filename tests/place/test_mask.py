@@ -137,9 +137,7 @@ def test_page_paints_and_saves_what_stands_in_front(
         # A placement without a mask leaves none behind.
         page.click("#paint")
         page.click("#clear-mask")
-        page.click("#save")
-        page.wait_for_selector("#save:not([disabled])")
-        settle(opened)
+        save(opened)
         assert "occluder_mask" not in json.loads((out / "insert.json").read_text())
         assert not (out / "occluder.png").exists()
         # The test reads the canvas; the page does not.
