@@ -499,6 +499,22 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     assert checked.found == {"is_done": True}, "a batch knows it by the files of the package"
 
 
+def test_more_samples_where_their_noise_would_be_seen(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without ``--samples``; with it there are as many as asked for. The remedy names them."""
+    monkeypatch.setattr("warpir.report.result.SEEN_NOISE", 1e-4)
+    for asked in (None, "40"):
+        out = tmp_path / f"of-{asked}"
+        changes = {"width": "384", "device": "cpu", "denoise": "off", "samples": asked}
+        measured = go(arguments(inputs, out, **changes), out).record["measured"]
+        assert measured["samples"] == 40
+        taken = measured["mean_samples"]["object"]
+        assert 120.0 < taken <= 160.0 if asked is None else 36.0 < taken <= 40.0
+        of_remedy = 4 * max(40, round(taken))
+        assert f"--samples {of_remedy}" in (out / "report.html").read_text()
+
+
 def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device: str) -> None:
     """With what stays in front of the object; the result has the photo's size. A card has none."""
     large = {"photo": tmp_path / "photo.png", "mask": tmp_path / "mask.png"}

@@ -11,7 +11,7 @@ from tests.builders.shapes import camera, ground, placed, sphere
 from tests.statistics import z_test
 from warpir.core.arrays import Float64Array, FloatArray, IntArray
 from warpir.render import allocation
-from warpir.render.allocation import as_it_is, as_shown, by_noise
+from warpir.render.allocation import MOST, Sharing, as_it_is, as_shown, by_noise
 from warpir.render.device import Launcher
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
@@ -43,10 +43,12 @@ class Noise:
         return (1.0 + noise).astype(np.float32), np.full(len(rows), spp, np.float32)
 
 
-def spread(noise: Noise, spp: int = 64) -> tuple[FloatArray, ...]:
-    """Share ``spp`` samples out."""
+def spread(noise: Noise, spp: int = 64, most: float | None = None) -> tuple[FloatArray, ...]:
+    """Share ``spp`` samples out, or more where the picture has more noise than ``most``."""
     launcher = Launcher(wp.get_device("cpu"), 1)
-    return by_noise(launcher, noise, as_it_is, PIXELS, WIDTH, (spp, 1))
+    rows, mean = by_noise(launcher, noise, Sharing(as_it_is, most), PIXELS, WIDTH, (spp, 1))
+    assert mean == noise.counts.mean()
+    return rows
 
 
 def a_spot() -> Float64Array:
@@ -73,6 +75,31 @@ def test_even_noise_has_even_samples() -> None:
         noise = Noise(deviation)
         spread(noise)
         assert (noise.counts == 64).all()
+
+
+@pytest.mark.parametrize("deviation", [a_spot(), np.ones(len(PIXELS))], ids=["spot", "even"])
+def test_noise_that_is_too_much_has_more_samples(deviation: Float64Array) -> None:
+    """As many as bring it below the limit, at most `MOST` times those asked for; else no more."""
+    values, counts = spread(Noise(deviation))
+    error = np.sqrt(((values - 1.0) ** 2).mean())
+    np.testing.assert_array_equal(spread(Noise(deviation), most=1.1 * error)[1], counts)
+    for share in (0.75, 0.55):
+        noise = Noise(deviation)
+        values, counts = spread(noise, most=share * error)
+        assert np.sqrt(((values - 1.0) ** 2).mean()) < 1.1 * share * error
+        assert 1.2 * 64 < noise.counts.mean() < 1.5 * 64 / share**2
+        assert counts.min() >= 32
+    noise = Noise(deviation)
+    spread(noise, most=0.01 * error)
+    assert 0.9 * MOST * 64 < noise.counts.mean() <= MOST * 64
+
+
+def test_large_pictures_have_few_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What they have beyond the asked samples is bounded, for time."""
+    monkeypatch.setattr(allocation, "MORE_WORK", 32 * len(PIXELS))
+    noise = Noise(a_spot())
+    spread(noise, most=1e-6)
+    assert 1.2 * 64 < noise.counts.mean() <= 1.5 * 64
 
 
 def test_small_pictures_have_no_pilot() -> None:
@@ -145,7 +172,7 @@ def test_highlights_of_metal(device: str, monkeypatch: pytest.MonkeyPatch) -> No
 
     even = np.array([render(seed) for seed in range(8)])
     del shares[:]
-    shared = np.array([render(seed, judged=as_it_is) for seed in range(8)])
+    shared = np.array([render(seed, sharing=Sharing(as_it_is)) for seed in range(8)])
     ones = [k for k, share in enumerate(shares) if share == pytest.approx(1.0)]
     assert len(ones) == 8 and renderer.span == (0.0, 1.0)
     first = shares[: ones[0] + 1]
@@ -154,7 +181,7 @@ def test_highlights_of_metal(device: str, monkeypatch: pytest.MonkeyPatch) -> No
     variance = (shared.var(axis=0, ddof=1) + even.var(axis=0, ddof=1)) / 8
     # Eight runs: outliers of a t distribution.
     assert z_test(shared.mean(axis=0), even.mean(axis=0), 2.0 * variance + 1e-6).passed
-    np.testing.assert_array_equal(shared[3], render(3, judged=as_it_is))
+    np.testing.assert_array_equal(shared[3], render(3, sharing=Sharing(as_it_is)))
 
 
 def test_gradients_take_even_samples(device: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from warpir.kernels.maths.lanes import LANES_MAX
 from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
-from warpir.render.allocation import Judged, by_noise, pilot_seed
+from warpir.render.allocation import Sharing, by_noise, pilot_seed
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels
 from warpir.render.device_light import PlaneLight, drawn, plane_radiance
@@ -104,6 +104,7 @@ class Renderer(Launcher):
 
     Attributes:
         bad_pixels: Counts of pixels that are not finite.
+        mean_samples: Of a pixel, when object and shadow were last traced.
     """
 
     def __init__(
@@ -123,6 +124,7 @@ class Renderer(Launcher):
         self.memory, self.lower = memory or Memory(str(self.device.alias)), lower
         self.is_ordered = is_ordered or bool(self.device.is_cpu)
         self.bad_pixels = BadPixels()
+        self.mean_samples: dict[str, float] = {}
         self._on_plane = PlaneLight(scene.receiver.normal)
 
     def load_kernels(self, mirrors: bool = False) -> None:
@@ -213,7 +215,7 @@ class Renderer(Launcher):
         vertex_record: VertexRecord | None = None,
         materials: MaterialArgs | None = None,
         is_recorded: bool = False,
-        judged: Judged | None = None,
+        sharing: Sharing | None = None,
     ) -> Foreground:
         """Path-trace the object alone (DiPIR, eq. 4).
 
@@ -231,9 +233,8 @@ class Renderer(Launcher):
             materials: In place of the scene's own (`Scene.materials_with`).
             is_recorded: Draw what a record holds also where none is given. Else the first vertex
                 picks among several directions of the light, which is less noisy.
-            judged: Where given, ``spp`` is a mean, and samples go where this function of radiance
-                is noisy (`warpir.render.allocation`): a pixel's depend on the others, and no record
-                is kept.
+            sharing: Where given, ``spp`` is a mean, and samples go where radiance is noisy
+                (`warpir.render.allocation`): a pixel's depend on the others, and no record is kept.
         """
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)
@@ -243,7 +244,7 @@ class Renderer(Launcher):
         launch = ObjectLaunch(
             drawn_light, own, view, rays, depth, indirect_limit, seed, is_recorded=is_recorded
         )
-        return self._object(launch, pixels, spp, (light_record, vertex_record), judged)
+        return self._object(launch, pixels, spp, (light_record, vertex_record), sharing)
 
     def _object(
         self,
@@ -251,7 +252,7 @@ class Renderer(Launcher):
         pixels: IntArray,
         spp: int,
         records: tuple[LightRecord | VertexRecord | None, ...],
-        judged: Judged | None,
+        sharing: Sharing | None,
     ) -> Foreground:
         """Trace what `foreground` has set up."""
 
@@ -275,7 +276,9 @@ class Renderer(Launcher):
             )
 
         width = self.scene.camera.width
-        *planes, mask = by_noise(self, rows_of, judged, pixels, width, (spp, launch.rays))
+        (*planes, mask), self.mean_samples["object"] = by_noise(
+            self, rows_of, sharing, pixels, width, (spp, launch.rays)
+        )
         traced = self.bad_pixels.blackened(tuple(planes), pixels, width, "object", first_bad_sample)
         radiance, diffuse, emission = traced
         # The whole is bounded by what was gathered, its parts are not (`variate_share`).
@@ -297,7 +300,7 @@ class Renderer(Launcher):
         indirect_limit: float = 0.0,
         may_gain: BoolArray | None = None,
         is_recorded: bool = False,
-        judged: Judged | None = None,
+        sharing: Sharing | None = None,
     ) -> ReceiverRadiance:
         """Radiance of the white receiver with and without the object (both halves of DiPIR, eq. 5).
 
@@ -320,7 +323,7 @@ class Renderer(Launcher):
                 [receiver_pixel]; None: it may everywhere. A ``thrown_record`` needs all of them.
             is_recorded: Draw what a record holds also where none is given. Else a plane's loss is
                 sampled, which is less noisy (`warpir.kernels.receiver.trace_plane_shadow`).
-            judged: As in `foreground`, a function of the ratio.
+            sharing: As in `foreground`, by the noise of the ratio.
         """
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)
@@ -342,7 +345,7 @@ class Renderer(Launcher):
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"
         rows, records = (pixels, may_see_object, gain), (record, thrown_record)
-        return self._white_radiance(launch, rows, spp, records, camera_args, judged)
+        return self._white_radiance(launch, rows, spp, records, camera_args, sharing)
 
     def _white_radiance(
         self,
@@ -351,7 +354,7 @@ class Renderer(Launcher):
         spp: int,
         records: tuple[LightRecord | None, LightRecord | None],
         camera_args: CameraArgs | None,
-        judged: Judged | None,
+        sharing: Sharing | None,
     ) -> ReceiverRadiance:
         """Trace what `receiver` has set up; ``rows`` are its pixels, and what they see and gain."""
         pixels, may_see_object, gain = rows
@@ -381,7 +384,9 @@ class Renderer(Launcher):
                 lambda spp: not all_finite(launch.sums(self, alone, hidden, gains, spp)), spp
             )
 
-        traced = by_noise(self, rows_of, judged, pixels, width, (spp, launch.rays))
+        traced, self.mean_samples[stage] = by_noise(
+            self, rows_of, sharing, pixels, width, (spp, launch.rays)
+        )
         # Black with and without the object: there the photo stays as it is.
         traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
         return ReceiverRadiance(*traced)

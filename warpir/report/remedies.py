@@ -44,6 +44,7 @@ def remedies(
     """
     asked, measured = config.flat(), record["measured"]
     samples = measured.get("samples", asked["samples"])  # older records state the asked number
+    samples = max(samples, *map(round, measured.get("mean_samples", {}).values()), 1)
     found = [] if config.is_guided else [*_light(asked, measured)]
     if asked["camera"] is None and not asked["demo"]:
         found += _camera(asked, measured, camera)

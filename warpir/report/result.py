@@ -25,7 +25,7 @@ from warpir.render.composite import Picture, make_picture
 from warpir.render.device_scene import Scene
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.photo_scene import scene_of
-from warpir.render.picture.quality import Quality
+from warpir.render.picture.quality import SEEN_NOISE, Quality
 from warpir.render.renderer import Renderer
 from warpir.report.page import Results
 from warpir.report.pictures import shrink
@@ -60,7 +60,7 @@ class RenderedResult:
     device: str
     """Name of the Warp device that rendered it."""
     measured: dict[str, Any]
-    """Samples, triangles, bad pixels and repeated launches, for ``run.json``."""
+    """Samples, asked for and taken, triangles, bad pixels and repeats, for ``run.json``."""
 
 
 def place_result(run: Run, light: SceneLight) -> Scene:
@@ -79,11 +79,18 @@ def render_result(run: Run, light: SceneLight, look: CameraLook, placed: Scene) 
             placed, quality.threads or 0, report, run.memory, bounce_depth=quality.bounce_depth
         )
         samples = quality.samples_at(camera.width, camera.height)
-        picture = _picture(run, light, renderer, samples, quality.rays, look)
+        # As many as were asked for; without such a wish more where their noise would be seen.
+        noise = SEEN_NOISE if quality.samples is None else None
+        picture = _picture(run, light, renderer, (samples, quality.rays), look, noise)
     run.log.notices += run.memory.notices()  # printed when it happened
     run.log.notice(*renderer.bad_pixels.notices())
     measured = {
         "samples": samples,
+        "mean_samples": {
+            name: round(mean, 1)
+            for name, mean in renderer.mean_samples.items()
+            if name in ("object", "shadow")
+        },
         "triangles": renderer.scene.triangle_count,
         "rays": renderer.scene.rays,
         "bad_pixels": renderer.bad_pixels.count,
@@ -108,7 +115,7 @@ def write_preview(run: Run, light: SceneLight) -> None:
         placed = scene_of(run.inputs, camera, run.device, light.curves)
         asked = run.config.render
         renderer = Renderer(placed, asked.threads or 0, bounce_depth=asked.bounce_depth)
-        picture = _picture(run, light, renderer, PREVIEW_SAMPLES, 1, look)
+        picture = _picture(run, light, renderer, (PREVIEW_SAMPLES, 1), look)
         codes = picture.codes_in(run.inputs.photo)
         run.log.say(f"preview: {run.output.write_preview(0, codes, run.inputs.photo.icc)}")
 
@@ -155,23 +162,26 @@ def _picture(
     run: Run,
     light: SceneLight,
     renderer: Renderer,
-    samples: int,
-    rays: int,
+    samples: tuple[int, int],
     look: CameraLook,
+    noise: float | None = None,
 ) -> Picture:
+    """Render and composite; ``samples`` are those of a pixel, and the rays of each."""
     inputs, quality = run.inputs, run.config.render
+    is_denoised = quality.denoise == "auto" and denoiser_version() is not None
     return make_picture(
         renderer,
         light.on_object,
         light.light_shadow,
         inputs.photo,
         Quality(
-            samples,
-            rays,
+            *samples,
             quality.depth,
             quality.seed,
             quality.indirect_limit * inputs.photo.unit,
-            is_denoised=quality.denoise == "auto" and denoiser_version() is not None,
+            noise=None if is_denoised else noise,
+            white=inputs.photo.unit,
+            is_denoised=is_denoised,
             ground_roughness=quality.coat_roughness,
         ),
         light.curves,

@@ -23,7 +23,7 @@ from warpir.kernels.types import (
     LightRecord,
     VertexRecord,
 )
-from warpir.render.allocation import as_it_is
+from warpir.render.allocation import Sharing, as_it_is
 from warpir.render.device import SAMPLES_PER_SLICE, Rows
 from warpir.render.launches import directions_of_path
 from warpir.render.renderer import ReceiverRadiance, Renderer
@@ -122,7 +122,7 @@ class ObjectSamples:
             vertex_record=vertex,
             materials=self.materials,
             is_recorded=any(self.free),
-            judged=None if any(self.free) else as_it_is,
+            sharing=None if any(self.free) else Sharing(as_it_is),
         )
         return out.radiance, light, vertex
 
@@ -269,7 +269,7 @@ class ReceiverSamples:
             record=record,
             thrown_record=thrown,
             is_recorded=self.free[0],
-            judged=None if self.free[0] else as_it_is,
+            sharing=None if self.free[0] else Sharing(as_it_is),
         )
         return out, record, thrown
 

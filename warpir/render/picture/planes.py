@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
 from warpir.look.denoise import denoised_object, denoised_ratio
-from warpir.render.allocation import as_shown
+from warpir.render.allocation import Sharing, as_shown
 from warpir.render.device_light import light_args
 from warpir.render.picture.quality import Quality
 from warpir.render.picture.tone import tone_mapped
@@ -73,7 +74,7 @@ def render(
         quality.depth,
         quality.seed,
         quality.indirect_limit,
-        judged=as_shown,
+        sharing=Sharing(partial(as_shown, white=quality.white), quality.noise),
     )
     receiver_pixels, ratio = _shadow(
         renderer,

@@ -19,7 +19,7 @@ import numpy as np
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray, IntArray
 from warpir.io.images.resize import resize
 from warpir.kernels.types import LightArgs
-from warpir.render.allocation import as_shown
+from warpir.render.allocation import Sharing, as_shown
 from warpir.render.picture.quality import Quality
 from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import BLOCK, Pilot, dilate, neighbourhood, run_pilot
@@ -82,7 +82,7 @@ def picture_ratio(
         quality.seed,
         indirect_limit=quality.indirect_limit,
         may_gain=gain_bends[whole],
-        judged=as_shown,
+        sharing=Sharing(as_shown, quality.noise),
     )
     ratio[whole] = renderer.ratio(traced)
     return pixels, np.where(gain_bends[:, None], ratio, ratio + thrown)
