@@ -161,6 +161,7 @@ def _joined(config: InsertConfig, files: _Files, must_be_seen: bool) -> Inputs:
     """
     straight, undistorted_by = _straightened(files)
     world = make_world(config.camera, config.placement.place, files.view, files.points)
+    world = replace(world, photo=straight.photo)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
     placement = stand_on_ground(
         config.placement, files.asset, world, mesh, config.camera.plane, must_be_seen

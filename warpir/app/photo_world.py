@@ -14,6 +14,7 @@ from warpir.core.limits import LIMITS, Limits
 from warpir.io.cameras.reader import read_photo_camera
 from warpir.io.cameras.source import PhotoCamera
 from warpir.io.images.photos import Photo
+from warpir.io.images.resize import resize
 from warpir.scene.asset import Asset
 from warpir.scene.camera import (
     ASSUMED,
@@ -26,7 +27,15 @@ from warpir.scene.camera import (
     camera_pose,
     horizon_row,
 )
-from warpir.scene.free_space import Cloud, Place, Stand, find_place
+from warpir.scene.free_space import (
+    BLOCK,
+    LOOKED_AT,
+    Cloud,
+    OpenGround,
+    Place,
+    Stand,
+    find_place,
+)
 from warpir.scene.ground import fit_ground
 from warpir.scene.placement import (
     DEFAULT_STAND,
@@ -87,6 +96,8 @@ class PhotoWorld:
     """What was turned, one line each."""
     measured: dict[str, Any] = field(default_factory=dict)
     """What ``run.json`` says of the fit."""
+    photo: Photo | None = None
+    """As the camera sees it; without it nothing is known of how the ground looks."""
 
 
 def photo_camera(
@@ -385,7 +396,8 @@ def _set_free(
 ) -> Placement:
     """Place an object that was not placed: in the lower middle, else where it is seen whole.
 
-    With a mesh and no points only the usual pixel is tried.
+    Without points it stands on what looks like open ground. With a mesh and no points only the
+    usual pixel is tried.
 
     Raises:
         InputError: There is no free place, or no ground in view.
@@ -397,20 +409,22 @@ def _set_free(
 
     if mesh is not None and world.cloud is None:
         return put(None)
+    eye = world.camera.c2w[:3, 3]
+    plane = upright_plane(world.ground, eye)
+    ground = _open_ground(world, plane)
     if world.cloud is None:
         try:
             usual = put(None)
         except InputError:
             pass  # above the horizon, or outside the photo: the search below tells
         else:
-            if Stand(usual.asset_to_world, low, high, world.camera).is_well_seen:
+            there = Stand(usual.asset_to_world, low, high, world.camera)
+            if there.is_well_seen and (ground is None or ground.holds(there)):
                 return usual
-    eye = world.camera.c2w[:3, 3]
-    plane = upright_plane(world.ground, eye)
     own, keeps_size = float((high - low).max()), is_sized
     lines = []
     try:
-        place = find_place(stand, world.camera, plane, world.cloud)
+        place = find_place(stand, world.camera, plane, world.cloud, ground)
     except InputError:
         if is_sized or world.cloud is not None:
             raise
@@ -423,7 +437,9 @@ def _set_free(
     if not keeps_size:
         away = min(away, _usual_distance(world.camera, plane))
         size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
-        place = find_place(lambda there: stand(there, size), world.camera, plane, world.cloud)
+        place = find_place(
+            lambda there: stand(there, size), world.camera, plane, world.cloud, ground
+        )
         placement = put(place, size)
         lines.append(
             f"the object is {size:g} m large, since with its own {own:.3g} m "
@@ -432,10 +448,22 @@ def _set_free(
     shown = ",".join(f"{round(x, 3) + 0.0:.3g}" for x in place)
     why = "where no points are in its way"
     if world.cloud is None:
-        is_cut = Stand(placement.asset_to_world, low, high, world.camera).is_cut
-        why = "since the frame cuts it everywhere" if is_cut else "where it is seen whole"
+        there = Stand(placement.asset_to_world, low, high, world.camera)
+        why = "since the frame cuts it everywhere" if there.is_cut else "where it is seen whole"
+        if ground is not None and ground.holds(there):
+            why += ", on what looks like open ground"
     lines.append(f"the object stands at {shown}, {why} (--at, --place)")
     return replace(placement, assumed=(*placement.assumed, *lines))
+
+
+def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:
+    """Return how the ground looks, where no points tell what stands there."""
+    if world.photo is None or world.cloud is not None:
+        return None
+    shown = world.photo.exposed()[0]
+    share = min(1.0, LOOKED_AT / max(shown.shape[:2]))
+    height, width = (BLOCK * max(1, round(share * side / BLOCK)) for side in shown.shape[:2])
+    return OpenGround.of(resize(shown, height, width), world.camera, plane)
 
 
 def _usual_distance(camera: Camera, plane: Float64Array) -> float:

@@ -117,7 +117,7 @@ def open_session(
 
     def seen_by(asked: CameraConfig) -> tuple[PhotoWorld, Float64Array, list[str]]:
         view = photo_camera(asked, photo, name, estimate_photo, limits)
-        world = make_world(asked, placement.place, view, None)
+        world = replace(make_world(asked, placement.place, view, None), photo=photo)
         try:
             placed = stand_on_ground(placement, asset, world)
         except InputError as error:
