@@ -1,15 +1,19 @@
 """The tables of reasons: every call of one gives its sentence what it needs."""
 
 import ast
+import pickle
 import string
 from collections import defaultdict
+from copy import copy
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import warpir
-from warpir.core.errors import Faults
+from warpir.core.errors import ExitCode, Faults, InputError
+from warpir.diffusion.models.model_error import ModelError
+from warpir.diffusion.prior import NonFiniteError
 
 ROOT = Path(warpir.__file__).parent
 SOURCES = {path: ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
@@ -81,3 +85,21 @@ def test_sentence_is_made_of_its_fields() -> None:
     }  # fmt: skip
     odd = table.error("file", "odd", found="{x}", expected="even", advice="add one")
     assert (odd.what, odd.advice) == ("{x} is odd (expected even)", "add one")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        InputError("a.jpg", "is bad", "mend it", ExitCode.OUTPUT, reason="a.b", found=(1, 2)),
+        ModelError("dir", "is no model"),
+        NonFiniteError("the loss is NaN"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_errors_leave_a_process_whole(error: InputError) -> None:
+    """One that cannot be read back breaks a whole `ProcessPoolExecutor`."""
+    error.also = (InputError("b.jpg", "too"),)
+    for other in (pickle.loads(pickle.dumps(error)), copy(error)):
+        assert (type(other), str(other)) == (type(error), str(error))
+        assert {**vars(other), "also": 0} == {**vars(error), "also": 0}
+        assert str(other.also[0]) == "b.jpg: too"

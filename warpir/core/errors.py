@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import warpir
 
@@ -77,6 +78,10 @@ class InputError(Exception):
         self.fields = fields
         self.also: tuple[InputError, ...] = ()
         """Further problems found in the same pass; printed, but they decide nothing."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let it be copied and pickled, though subclasses take other arguments."""
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class Faults:
