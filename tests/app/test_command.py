@@ -201,6 +201,8 @@ def problems_of(**values: Any) -> list[InputError]:
         ("overwrite", 1, "bool"),
         ("seed", True, "int"),
         ("photo", 3, "str"),
+        ("place", np.zeros((3, 1)), "tuple[float, float, float]"),
+        ("time_min", "x", "float"),
     ],
 )
 def test_values_of_another_kind_are_refused(name: str, value: Any, expected: str) -> None:
@@ -214,6 +216,8 @@ def test_paths_lists_and_whole_numbers_are_taken() -> None:
     assert not problems_of(
         photo=Path("a.png"), at=[165, 141], fov=np.float32(50), samples=np.int64(8)
     )
+    given: dict[str, Any] = {"place": np.float32([0.5, 0, -4]), "report": np.bool_(False)}
+    assert InsertConfig(**given) == InsertConfig(place=(0.5, 0.0, -4.0), report=False)
 
 
 def test_values_are_kept_as_json_holds_them() -> None:

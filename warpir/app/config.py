@@ -213,12 +213,12 @@ def _values_out_of_range(config: InsertConfig) -> Iterator[InputError]:
             yield usage(flag(name), f"{expected} (found {_shown(value)})")
 
     values = config.flat()
-    of_other_kinds = [name for name, value in values.items() if not is_a(value, OPTIONS[name].kind)]
-    for name in of_other_kinds:
-        expected = str(OPTIONS[name].kind).removeprefix("<class '").removesuffix("'>")
-        yield usage(flag(name), f"expected {expected} (found {_shown(values[name])})")
-    if of_other_kinds:
-        return  # from Python alone, and no other check would know what to do with them
+    of_other_kinds = []
+    for name, value in values.items():
+        if not is_a(value, OPTIONS[name].kind):
+            expected = str(OPTIONS[name].kind).removeprefix("<class '").removesuffix("'>")
+            of_other_kinds.append(usage(flag(name), f"expected {expected} (found {_shown(value)})"))
+    raise_all(of_other_kinds)  # from Python alone; no other check would know what to do with them
     for name, value in values.items():
         yield from _not_plain(name, value, config.limits.prompt_bytes)
     in_order = config.optimize.fusion_end >= config.optimize.fusion_start

@@ -85,7 +85,9 @@ def help_of(settings: type) -> dict[str, str]:
 
 
 def plain(value: object) -> object:
-    """Return a value as JSON holds it: a path as text, NumPy's numbers as Python's."""
+    """Return a value as JSON holds it: a path as text, NumPy's numbers and arrays as Python's."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, tuple | list):
         return tuple(map(plain, value))
     if isinstance(value, os.PathLike):
