@@ -19,6 +19,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -233,11 +234,14 @@ def _validate(config: InsertConfig) -> None:
 
 
 class _CallableModule(ModuleType):
-    """Lets ``from warpir import insert; insert(config)`` work: the module calls its function."""
+    """Lets ``from warpir import insert; insert(config)`` work, and ``pool.map(insert, ...)``."""
 
-    def __call__(self, config: InsertConfig) -> Insertion:
+    def __call__(self, config: InsertConfig, *, renews: bool = False) -> Insertion:
         """Insert one object; see `insert`."""
-        return insert(config)
+        return insert(config, renews=renews)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return import_module, (self.__name__,)
 
 
 sys.modules[__name__].__class__ = _CallableModule

@@ -1,7 +1,9 @@
 """The command line: flags, configuration files, errors, exit codes, and what is not imported."""
 
+import inspect
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -976,6 +978,8 @@ def test_insert_is_called_through_the_module() -> None:
         insert(InsertConfig(out="o"))
     with pytest.raises(InputError, match="--photo: needed"):
         insert.insert(InsertConfig(out="o"))
+    assert pickle.loads(pickle.dumps(insert)) is insert, "a pool of processes can be given it"
+    assert "renews" in inspect.signature(insert).parameters
 
 
 def test_demo_leaves_its_light_to_guidance() -> None:
