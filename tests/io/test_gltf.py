@@ -1441,6 +1441,7 @@ def test_M14_limit_of_texture_pixels_is_ours(
     builder = Builder()
     builder.base_color({"bufferView": builder.view(png(size=8)), "mimeType": "image/png"})
     assert load(tmp_path, builder).textures[0].pixels.shape == (8, 8, 4)
+    assert Image.MAX_IMAGE_PIXELS == 16
 
 
 @pytest.mark.case("M18")

@@ -10,6 +10,7 @@ import numpy as np
 
 from warpir.core.arrays import CodeArray
 from warpir.io.images.decoder import upright
+from warpir.io.images.kinds import open_by_pillow
 
 FIRST_ROWS = (16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55)
 """First two rows of the luminance table of ITU-T T.81, Annex K.1, that quality 50 stands for."""
@@ -44,7 +45,7 @@ class JpegCoding:
         tables = [list(table) for table in self.tables]
         picture = Image.fromarray(np.ascontiguousarray(stored))
         picture.save(file, "JPEG", qtables=tables, subsampling=self.subsampling)
-        with Image.open(file) as image:
+        with open_by_pillow(file) as image:
             decoded = np.asarray(image)
         turned: CodeArray = np.ascontiguousarray(upright(decoded, self.orientation))
         return turned
@@ -52,10 +53,9 @@ class JpegCoding:
 
 def read_coding(path: Path, orientation: int) -> JpegCoding | None:
     """Return how a JPEG file was coded; None where it is neither grey nor YCbCr in 8 bits."""
-    from PIL import Image, JpegImagePlugin
+    from PIL import JpegImagePlugin
 
-    Image.MAX_IMAGE_PIXELS = None  # ours, which --max-pixels raises, was checked before
-    with Image.open(path) as image:
+    with open_by_pillow(path) as image:
         if not isinstance(image, JpegImagePlugin.JpegImageFile) or image.mode not in ("RGB", "L"):
             return None
         tables = tuple(tuple(image.quantization[k]) for k in sorted(image.quantization)[:2])

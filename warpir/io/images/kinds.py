@@ -1,11 +1,18 @@
 """What kind of image a file is, by its content, before any library opens it."""
 
+from __future__ import annotations
+
 import re
 import stat
 import struct
+import threading
 from pathlib import Path
+from typing import IO, TYPE_CHECKING
 
 from warpir.core.errors import InputError
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 _MAGIC = {
     "jpeg": (b"\xff\xd8\xff",),
@@ -25,6 +32,23 @@ _MOST_READ = 1 << 28
 """More than a picture has that is not refused for its pixels [byte]; a phone may append a film."""
 _MOST_SCANS = 100
 """Scans of a JPEG; encoders write about 10, and each of them costs a pass over the picture."""
+
+_OPENING = threading.Lock()
+
+
+def open_by_pillow(file: Path | IO[bytes], formats: tuple[str, ...] | None = None) -> Image.Image:
+    """Open as ``PIL.Image.open``, without Pillow's limit of pixels: ours may be raised.
+
+    For other users of Pillow in this process the limit stays.
+    """
+    from PIL import Image
+
+    with _OPENING:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(file, formats=formats)
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def check_regular_file(path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from warpir.core.arrays import PixelArray
 from warpir.core.errors import InputError
+from warpir.io.images.kinds import open_by_pillow
 
 _FOREIGN_TIFF = {
     4: "a transparency mask",
@@ -56,11 +57,11 @@ def tiff_codes(path: Path, spec: Any, pixels: PixelArray) -> PixelArray:
 
 def _palette(path: Path) -> tuple[int, ...]:
     """Return the entries of a TIFF's ColorMap; none where they cannot be read."""
-    from PIL import Image, TiffImagePlugin
+    from PIL import TiffImagePlugin
 
     try:
-        with Image.open(path) as picture:
+        with open_by_pillow(path) as picture:
             assert isinstance(picture, TiffImagePlugin.TiffImageFile)
             return tuple(picture.tag_v2.get(TiffImagePlugin.COLORMAP, ()))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError):
         return ()

@@ -19,6 +19,7 @@ import numpy as np
 from warpir.core.arrays import CodeArray
 from warpir.core.errors import InputError
 from warpir.core.limits import Limits
+from warpir.io.images.kinds import open_by_pillow
 from warpir.scene.asset import ABSENT, Material
 
 GREY = (0.8, 0.8, 0.8)
@@ -178,8 +179,7 @@ class TextureDecoder:
                 found="KTX2",
             )
         try:
-            Image.MAX_IMAGE_PIXELS = None  # ours is checked before a pixel is decoded
-            image: Image.Image = Image.open(BytesIO(encoded), formats=["PNG", "JPEG", "WEBP"])
+            image = open_by_pillow(BytesIO(encoded), ("PNG", "JPEG", "WEBP"))
             self.count(image.width * image.height, pointer)
             if self.measures:
                 return grey_pixels()
