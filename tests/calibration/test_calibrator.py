@@ -92,6 +92,13 @@ def test_photo_without_pixels_is_refused() -> None:
         estimate_camera(np.zeros((0, 4, 3), np.float32), random_calibrator(0, SMALL).calibrator())
 
 
+@pytest.mark.parametrize("value", [np.uint8(200), np.float32(-0.1), np.float32("nan")])
+def test_photo_of_other_numbers_is_refused(value: Any) -> None:
+    """Codes of 8 bits, as Pillow reads them, were clipped to a white picture."""
+    with pytest.raises(InputError, match="from 0 to 1"):
+        estimate_camera(np.full((8, 9, 3), value), random_calibrator(0, SMALL).calibrator())
+
+
 def test_known_field_of_view_is_kept() -> None:
     photo = np.full((20, 30, 3), 0.5, np.float32)
     estimate = estimate_camera(photo, random_calibrator(0, SMALL).calibrator(), vfov_deg=41.0)

@@ -40,9 +40,13 @@ def estimate_camera(
             with a standard deviation of 0, and the other numbers are estimated with it.
 
     Raises:
-        InputError: The photo has no pixels, or the network's file cannot be used
-            (`ExitCode.MODEL`).
+        InputError: The photo has no pixels, or values outside of [0, 1] such as codes of 8 bits, or
+            the network's file cannot be used (`ExitCode.MODEL`).
     """
+    if photo.size and not 0.0 <= photo.min() <= photo.max() <= 1.0:  # nor NaN
+        values = f"found {photo.min():g} to {photo.max():g}"
+        what = f"expected display-encoded values from 0 to 1 ({values})"
+        raise InputError("--photo", what, "divide codes of 8 bits by 255")
     alone = network_estimate(photo, network or load_calibrator(), vfov_deg)
     found = decided(with_lines(alone, photo))
     seen_as = looks_like(photo)
