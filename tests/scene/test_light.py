@@ -483,6 +483,12 @@ def test_black_map_fits_black_lobes() -> None:
     assert fit.flux_error == 0.0 and fit.irradiance_error == 0.0
 
 
+def test_a_fit_of_no_lobes_is_refused() -> None:
+    """SciPy's solver ends the process where there is nothing to solve for."""
+    with pytest.raises(ValueError, match="at least one"):
+        fit_lobes(np.ones((16, 32, 3), np.float32), 0)
+
+
 # ------------------------------------------------------------------- from flags to a light
 
 

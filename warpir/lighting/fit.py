@@ -38,7 +38,12 @@ def fit_lobes(texels: FloatArray, count: int) -> LobeFit:
     Args:
         texels: Radiance, shape [He, We, 3].
         count: Number of lobes, at least 1.
+
+    Raises:
+        ValueError: It is less.
     """
+    if count < 1:
+        raise ValueError(f"a fit needs at least one lobe (found {count})")
     found = lamps_of(texels, min(count, LAMP_COUNT_MAX))
     axes, sharpnesses, lamps = found.axes, found.sharpness, len(found.axes)
     # Broad lobes spaced evenly; this width keeps their sum within 2 % of a constant.
