@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -83,6 +84,19 @@ def test_driver_is_too_old_for_torch(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("not reached")
     assert found.value.code == ExitCode.USAGE and "--device cpu" in found.value.advice
     assert torch.get_num_threads() == threads
+
+
+def test_fork_of_a_process_that_has_rendered_is_refused() -> None:
+    """It waited for ever for threads of OpenEXR that it had not inherited."""
+    if (pid := os.fork()) == 0:
+        status = 1
+        with suppress(BaseException):
+            with pytest.raises(InputError, match="forked"):
+                choose_device("cpu")
+            status = 0
+        os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    assert choose_device("cpu") == "cpu"
 
 
 BUSY = """

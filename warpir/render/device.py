@@ -8,6 +8,7 @@ slices and threads do not change a result.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ SAMPLES_PER_SLICE = 1 << 16
 
 _kernel_caches: list[KernelCache] = []
 """Kernel cache of this process, if it has its own."""
+_started_by: list[int] = []
+"""Process that has started Warp; one that is forked from it inherits this, but no thread."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,16 @@ def copied(struct: Any) -> Any:
 
 
 def start_warp() -> None:
-    """Start Warp once, with a kernel cache that is writable and valid."""
+    """Start Warp once, with a kernel cache that is writable and valid.
+
+    Raises:
+        InputError: The process was forked from one that had; OpenEXR and CUDA would wait for ever.
+    """
+    if _started_by not in ([], [os.getpid()]):
+        what = "was forked from one in which warpir had rendered, without its threads"
+        advice = 'start it by multiprocessing.get_context("spawn")'
+        raise InputError("process", what, advice, ExitCode.USAGE)
+    _started_by[:] = [os.getpid()]
     # The banner, the lines of each loaded module and "no CUDA driver" are for `--debug`.
     if not logging.getLogger().isEnabledFor(logging.DEBUG):
         wp.config.log_level = wp.LOG_ERROR
@@ -85,7 +97,8 @@ def choose_device(name: str | None) -> str:
     """Return the Warp device to use: the one asked for, else CUDA where there is one, else CPU.
 
     Raises:
-        InputError: The device does not exist, or is older than those that Warp compiles for.
+        InputError: The device does not exist, or is older than those that Warp compiles for; or as
+            of `start_warp`.
     """
     start_warp()
     known = [d.alias for d in wp.get_devices()]
