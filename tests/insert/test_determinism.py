@@ -133,9 +133,12 @@ def test_number_of_threads_is_that_of_the_network() -> None:
 @pytest.mark.case("R13")
 def test_arithmetic_comes_back_after_an_error() -> None:
     before = torch.get_num_threads()
+    stream = torch.random.get_rng_state()
     with pytest.raises(KeyboardInterrupt), fixed_arithmetic("cpu", False):
+        torch.rand(1)
         raise KeyboardInterrupt
     assert torch.get_num_threads() == before
+    assert torch.equal(torch.random.get_rng_state(), stream)
     assert not torch.are_deterministic_algorithms_enabled()
 
 

@@ -36,7 +36,7 @@ WORKSPACE = ":4096:8"
 
 @contextmanager
 def fixed_arithmetic(device: str, is_deterministic: bool) -> Iterator[None]:
-    """Within this context torch computes the same bytes each time.
+    """Within this context torch computes the same bytes each time; its random stream stays.
 
     On the CPU always, with `THREADS` threads; on CUDA if ``is_deterministic``, and then Warp's
     kernels too.
@@ -72,7 +72,9 @@ def fixed_arithmetic(device: str, is_deterministic: bool) -> Iterator[None]:
     # It exposes reads of uninitialised memory, at the cost of writing all of it.
     memory.fill_uninitialized_memory = False
     try:
-        yield
+        # Libraries draw weights that are then replaced: nothing here depends on the stream.
+        with torch.random.fork_rng(devices=[]):
+            yield
     finally:
         torch.set_num_threads(threads)
         torch.set_deterministic_debug_mode(mode)
