@@ -254,6 +254,20 @@ def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) 
         make_world(CameraConfig(), None, view, None)
 
 
+def test_an_object_hangs_from_no_ground_that_was_only_assumed() -> None:
+    """Worlds of nerfstudio have cameras below y = 0: such a ground must be asked for, and is said.
+
+    A wall is no ground from below.
+    """
+    view = PhotoCamera(replace(CAMERA, c2w=affine_matrix(np.eye(3), (0.0, -0.3, 0.0))))
+    with pytest.raises(InputError, match=r"0\.3 m below the ground y = 0"):
+        make_world(CameraConfig(), None, view, None)
+    (notice,) = make_world(CameraConfig(ground=(0, 2, 0, -1)), None, view, None).notices
+    assert "0.8 m below the ground" in notice and "head down" in notice
+    for ground in ((0.0, 1.0, 0.0, 1.5), (0.0, -0.1, 1.0, 4.0)):
+        assert not make_world(CameraConfig(ground=ground), None, view, None).notices
+
+
 # -------------------------------------------------------------------------------------- free space
 
 

@@ -39,6 +39,7 @@ from warpir.scene.free_space import (
 from warpir.scene.ground import fit_ground
 from warpir.scene.placement import (
     DEFAULT_STAND,
+    STEEP,
     Placement,
     place_asset,
     point_on_ground,
@@ -294,7 +295,8 @@ def make_world(
     how that was turned.
 
     Raises:
-        InputError: No ground in the points, or nothing that tells which way is up.
+        InputError: No ground in the points, nothing that tells which way is up, or a ground that
+            is assumed above the camera.
     """
     camera, ground = view.camera, asked.ground
     fit = None
@@ -322,11 +324,29 @@ def make_world(
             "the camera file's world was turned so that the ground is level; --ground and --place "
             "count before that turn, camera.json after it"
         )
+    notices += _about_side(camera, ground)
     if fit is None or points is None or ground is None:
         return PhotoWorld(camera, ground, place, notices=tuple(notices))
     cloud = Cloud(points, points @ np.array(ground[:3]) + ground[3], fit.rms)
     measured = {"ground_fit": {**fit.record(), "plane": list(ground)}}
     return PhotoWorld(camera, ground, place, cloud, (fit.about,), tuple(notices), measured)
+
+
+def _about_side(camera: Camera, ground: tuple[float, float, float, float] | None) -> list[str]:
+    """Say where the camera sees the ground from below: an object there hangs head down.
+
+    Raises:
+        InputError: Nobody asked for that ground.
+    """
+    eye = camera.c2w[:3, 3]
+    plane = upright_plane(ground, eye)
+    if plane[1] > -STEEP:
+        return []
+    what = f"the camera is {float(plane[:3] @ eye + plane[3]):.3g} m below the ground"
+    if ground is None:
+        advice = "give a ground below it, as 0,1,0,H of one at y = -H; or --up"
+        raise InputError("--ground", f"{what} y = 0, which is assumed", advice)
+    return [f"{what}, from which the object hangs head down (--ground)"]
 
 
 def stand_on_ground(
