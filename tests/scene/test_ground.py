@@ -17,7 +17,7 @@ from warpir.app.photo_world import make_world
 from warpir.app.settings import CameraConfig
 from warpir.core.arrays import affine_matrix
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.cameras.source import PhotoCamera
+from warpir.io.cameras.source import UP_TO_Y, PhotoCamera
 from warpir.io.images.photos import read_photo
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.camera import Camera, camera_from_fov
@@ -252,6 +252,16 @@ def test_a_world_without_up_is_levelled_by_its_ground(rng: np.random.Generator) 
     np.testing.assert_allclose(seen, camera.project((rotation @ stand)[None]), atol=1e-6)
     with pytest.raises(InputError, match="which way is up"):
         make_world(CameraConfig(), None, view, None)
+
+
+def test_a_turned_world_is_told_where_something_is_placed_in_it() -> None:
+    """Coordinates of a file with +Z up are not those of --place and --proxy; the map is stated."""
+    view = PhotoCamera(CAMERA, world=UP_TO_Y["+z"])
+    asked = CameraConfig(proxy="mesh.glb")
+    (notice,) = make_world(asked, (0.0, 0.0, -4.0), view, None).notices
+    assert notice.endswith("its x,y,z are x,z,-y: so count --place, --proxy")
+    assert not make_world(CameraConfig(), None, view, None).notices
+    assert not make_world(asked, (0.0, 0.0, -4.0), PhotoCamera(CAMERA), None).notices
 
 
 def test_an_object_hangs_from_no_ground_that_was_only_assumed() -> None:

@@ -291,8 +291,8 @@ def make_world(
 ) -> PhotoWorld:
     """Find the ground in the points, and level a world whose up is not known by its ground.
 
-    ``place`` and the points, shape [point, 3], are in the world of the camera's file; ``view`` says
-    how that was turned.
+    The points, shape [point, 3], are in the world of the camera's file, and so are ground and
+    ``place`` where its up is unknown; ``view`` says how that was turned.
 
     Raises:
         InputError: No ground in the points, nothing that tells which way is up, or a ground that
@@ -304,7 +304,7 @@ def make_world(
         points = points @ view.world.T
         fit = fit_ground(points, camera, has_up=view.has_up)
         ground = _four(fit.plane)
-    notices = []
+    notices = _about_turn(asked, place, view)
     if not view.has_up:
         if ground is None:
             raise InputError(
@@ -330,6 +330,21 @@ def make_world(
     cloud = Cloud(points, points @ np.array(ground[:3]) + ground[3], fit.rms)
     measured = {"ground_fit": {**fit.record(), "plane": list(ground)}}
     return PhotoWorld(camera, ground, place, cloud, (fit.about,), tuple(notices), measured)
+
+
+def _about_turn(
+    asked: CameraConfig, place: tuple[float, float, float] | None, view: PhotoCamera
+) -> list[str]:
+    """Say that the file's world was turned, where something was given that counts after it."""
+    named = {"--ground": asked.ground, "--place": place, "--proxy": asked.proxy}
+    given = ", ".join(flag for flag, value in named.items() if value is not None)
+    if not given or np.array_equal(view.world, np.eye(3)):
+        return []
+    axes = [f"{'-' if row.min() < -0.5 else ''}{'xyz'[abs(row).argmax()]}" for row in view.world]
+    return [
+        f"the camera file's world was turned so that +y points up, where its x,y,z are "
+        f"{','.join(axes)}: so count {given}"
+    ]
 
 
 def _about_side(camera: Camera, ground: tuple[float, float, float, float] | None) -> list[str]:
