@@ -174,6 +174,19 @@ def test_place_that_is_moved_onto_the_ground_is_told(camera: Camera) -> None:
     assert not placed.warnings and not near.warnings
 
 
+@pytest.mark.parametrize(("table", "is_on_it"), [(0.5, True), (0.495, True), (0.3, False)])
+def test_place_that_is_moved_off_a_mesh_is_told(
+    camera: Camera, table: float, is_on_it: bool
+) -> None:
+    """A ground for all of the scene at the height of a table of --proxy is no advice."""
+    place = (0.5, 0.5, -4.0)
+    (line,) = place_asset(LOW, HIGH, camera, place=place, size=0.4, mesh=_table(table)).warnings
+    assert ("by --at, or with --no-plane" in line, "--ground 0,1" in line) == (
+        is_on_it,
+        not is_on_it,
+    )
+
+
 def test_placement_tells_distance_size_and_pixels() -> None:
     """A wrong horizon, height or unit shows in one line before anything is rendered."""
     camera = camera_from_fov(800, 600, 90.0, 0.0, 3.0)

@@ -115,7 +115,7 @@ def place_asset(
     if place is not None:
         stand = np.asarray(place, dtype=np.float64)
         if is_plane:
-            stand = _onto_ground(stand, plane, warnings)
+            stand = _onto_ground(stand, plane, mesh, warnings)
     else:
         if at is None:
             at = (DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height)
@@ -299,17 +299,24 @@ def _check_in_photo(at: tuple[float, float], camera: Camera) -> None:
         )
 
 
-def _onto_ground(stand: Float64Array, plane: Float64Array, warnings: list[str]) -> Float64Array:
+def _onto_ground(
+    stand: Float64Array, plane: Float64Array, mesh: ReceiverMesh | None, warnings: list[str]
+) -> Float64Array:
     """Return a place moved onto the ground along its normal, and warn where that is far."""
-    rise = float(plane[:3] @ stand + plane[3])
+    up, rise = plane[:3], float(plane[:3] @ stand + plane[3])
     if abs(rise) > OFF_GROUND:
         side = "above" if rise > 0.0 else "below"
-        level = ",".join(f"{part:.6g}" for part in (*plane[:3], plane[3] - rise))
+        level = ",".join(f"{part:.6g}" for part in (*up, plane[3] - rise))
+        advice = f"--ground {level} is a ground at its height"
+        if mesh is not None:
+            top, down = stand + OFF_GROUND * up, -2.0 * OFF_GROUND * up
+            if first_hit(mesh, top[None], down[None])[0][0] <= 1.0:
+                advice = "on --proxy, where it was, it stands by --at, or with --no-plane"
         warnings.append(
             f"--place is {abs(rise):.3g} m {side} the ground, onto which the object is moved; "
-            f"--ground {level} is a ground at its height"
+            f"{advice}"
         )
-    moved: Float64Array = stand - plane[:3] * rise
+    moved: Float64Array = stand - up * rise
     return moved
 
 
