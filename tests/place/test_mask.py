@@ -26,6 +26,7 @@ from tests.builders.programs.placing import (
 )
 from warpir.core.errors import InputError
 from warpir.place.session import mask_png
+from warpir.place.work import render_preview
 
 
 def encoded(picture: Image.Image, kind: str = "PNG") -> str:
@@ -40,6 +41,24 @@ def promising(side: int) -> str:
     header = struct.pack(">II", side, side) + b"\x08\0\0\0\0"
     content = base64.b64decode(encoded(Image.new("L", (4, 4))))
     return base64.b64encode(content[:8] + png_chunk(b"IHDR", header) + content[33:]).decode()
+
+
+def test_preview_has_the_shadow_mask_of_its_configuration(inputs: Path, tmp_path: Path) -> None:
+    """At the preview's size too: the ground is in shadow already, so no sun is taken away there."""
+    codes = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    codes[-1] = 0
+    Image.fromarray(codes).save(tmp_path / "shaded.png")
+    picture = tmp_path / "preview.png"
+    config = {"photo": str(inputs / "photo.png"), "asset": str(inputs / "wedge.glb"), "out": "x"}
+    config |= {"fov": 60.0, "pitch": -15.0, "place": (0.0, 0.0, -6.0)}
+    config |= {"sun": (-60.0, 30.0, 3.0), "sky": "overcast", "exposure": 0.0}
+    darkest = []
+    for mask in ({}, {"shadow_mask": str(tmp_path / "shaded.png")}):
+        job = {"config": config | mask, "width": 64, "picture": str(picture)}
+        render_preview(job, lambda said: None)
+        shown = np.asarray(Image.open(picture))
+        darkest.append(int(shown[len(shown) // 2 :, 40:].min()))  # right of the object
+    assert darkest[1] > darkest[0] + 20
 
 
 def test_mask_gets_the_size_of_the_photo() -> None:

@@ -52,16 +52,19 @@ class Kept(Loaders):
         self.light = self._small_light
 
     def shrunk(self, inputs: Inputs, width: int) -> Inputs:
-        """Return the inputs with photo, camera and mask at most this wide [px]."""
-        photo, camera, occluder = inputs.photo, inputs.camera, inputs.occluder
+        """Return the inputs with photo, camera and masks at most this wide [px]."""
+        photo, camera = inputs.photo, inputs.camera
+        occluder, shaded = inputs.occluder, inputs.shadow_mask
         if camera.width <= width:
             return inputs
         size = width, max(1, round(width * camera.height / camera.width))
         if self._small is None or self._small[0] is not photo or self._small[1] != size:
             self._small = photo, size, _small_photo(photo, size)
         occluder = None if occluder is None else _small_plane(occluder, size)
-        photo = self._small[2]
-        return replace(inputs, photo=photo, camera=camera.scaled(*size), occluder=occluder)
+        if shaded is not None:
+            shaded = replace(shaded, shares=_small_plane(shaded.shares, size))
+        small = replace(inputs, photo=self._small[2], camera=camera.scaled(*size))
+        return replace(small, occluder=occluder, shadow_mask=shaded)
 
     def thinned(self, inputs: Inputs, asked: InputConfig) -> Inputs:
         """Return the inputs with the object as the browser has it, where it is that heavy."""

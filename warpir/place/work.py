@@ -95,6 +95,7 @@ def render_preview(job: Mapping[str, Any], say: Say) -> dict[str, Any]:
         ),
         lit.curves,
         occluder=inputs.occluder,
+        shadow_mask=inputs.shadow_mask,
         look=look_of_preview(inputs.photo, config.look.response),
     )
     keep_kernels()  # this process may be killed
