@@ -43,6 +43,10 @@ NOT_HANDED_OVER = (
 NO_MESH_HANDED_OVER = (
     "the files for Blender, three.js and Mitsuba hold the ground plane, not the mesh of --proxy"
 )
+NO_MASK_HANDED_OVER = (
+    "the files for Blender, three.js and Mitsuba do not know --occluder-mask and --shadow-mask; "
+    "layers.exr does"
+)
 PREVIEW_SAMPLES = 16
 """Camera samples per pixel of the preview of an unguided run."""
 PREVIEW_SIDE = 900
@@ -243,6 +247,16 @@ class Written:
     """Entries of ``run.json``."""
 
 
+def _not_handed_over(inputs: Inputs) -> list[str]:
+    """Return what the files for other tools leave out of these inputs, one line each."""
+    left_out = {
+        NOT_HANDED_OVER: bool(inputs.lamps),
+        NO_MESH_HANDED_OVER: inputs.proxy is not None,
+        NO_MASK_HANDED_OVER: inputs.occluder is not None or inputs.shadow_mask is not None,
+    }
+    return [line for line, is_given in left_out.items() if is_given]
+
+
 def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
     """Stage all files of a result but Mitsuba's scene, the report and ``run.json``.
 
@@ -271,10 +285,8 @@ def write_results(run: Run, light: SceneLight, picture: Picture) -> Written:
         _write_usd(run, maps.name_on_object)
     summary = summarize(light.light)
     _say_what_is_seen(run, summary, picture)
-    if inputs.lamps and (asked.hand_off or asked.mitsuba):
-        run.log.notice(NOT_HANDED_OVER)
-    if inputs.proxy is not None and asked.hand_off:
-        run.log.notice(NO_MESH_HANDED_OVER)
+    if asked.hand_off:
+        run.log.notice(*_not_handed_over(inputs))
     measured = {
         **_measured(run, light, summary),
         **({"lamps": records_of(inputs.lamps)} if inputs.lamps else {}),

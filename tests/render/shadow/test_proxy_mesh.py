@@ -42,7 +42,7 @@ from warpir.render.renderer import Renderer
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
-from warpir.report.result import NO_MESH_HANDED_OVER
+from warpir.report.result import NO_MASK_HANDED_OVER, NO_MESH_HANDED_OVER
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import lamp_axes, without_lamps
@@ -600,13 +600,22 @@ def test_notices_of_a_place(
     assert "hides the object" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("flags", [{}, {"no_hand_off": ""}], ids=str)
-def test_files_for_other_tools_without_the_mesh_are_told(
-    files: Path, tmp_path: Path, flags: dict[str, str]
+@pytest.mark.parametrize(
+    ("flags", "lines"),
+    [
+        ({"proxy": "wall.glb"}, [NO_MESH_HANDED_OVER]),
+        ({"occluder_mask": "half.png"}, [NO_MASK_HANDED_OVER]),
+        ({"shadow_mask": "half.png", "no_hand_off": ""}, []),
+    ],
+    ids=str,
+)
+def test_what_files_for_other_tools_leave_out_is_told(
+    files: Path, tmp_path: Path, flags: dict[str, str], lines: list[str]
 ) -> None:
-    out = tmp_path / "o"
-    run = go(arguments(files, out, proxy=str(files / "wall.glb"), samples="1", **flags), out)
-    assert (NO_MESH_HANDED_OVER in run.record["notices"]) == (not flags)
+    """The mesh of the place and the photo's masks."""
+    out, paths = tmp_path / "o", {k: v and str(files / v) for k, v in flags.items()}
+    run = go(arguments(files, out, samples="1", **paths), out)
+    assert [n for n in run.record["notices"] if n.startswith("the files for")] == lines
 
 
 def test_exposure_looks_at_ground_that_the_sun_reaches(files: Path) -> None:
