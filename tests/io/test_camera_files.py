@@ -14,11 +14,11 @@ from tests.builders.gltf_files import pack_glb
 from tests.builders.poses import points_in_view, pose, write_json
 from tests.builders.refusals import unreadable
 from warpir.core.errors import ExitCode, InputError
-from warpir.io.cameras.reader import read_photo_camera
+from warpir.io.cameras.reader import ABOUT_UPSIDE_DOWN, read_photo_camera
 from warpir.io.cameras.source import PhotoCamera
 from warpir.io.layers import write_layers
 from warpir.io.results import OutputFolder
-from warpir.scene.camera import Camera
+from warpir.scene.camera import Camera, camera_pose
 
 PIXEL = 1e-3
 """How far projected points may differ from a format's own formula [px]."""
@@ -51,6 +51,16 @@ def opencv_pixels(
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
     yd = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
     return np.stack([fx * xd + cx, fy * yd + cy], axis=1)
+
+
+def test_a_camera_upside_down_is_told(tmp_path: Path) -> None:
+    """As of matrices in OpenCV's axes, of the wrong --up, and of photos that EXIF turns."""
+    own = {"w": 640, "h": 480, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
+    for roll, up, is_told in ((0.0, "y", False), (0.0, "-y", True), (180.0, "y", True)):
+        c2w = camera_pose(-20.0, roll, 1.6)
+        path = write_json(tmp_path / "camera.json", {**own, "c2w": c2w.tolist()})
+        notices = read_photo_camera(path, SIZE, up).camera.notices
+        assert (ABOUT_UPSIDE_DOWN in notices) == is_told
 
 
 # ----------------------------------------------------------------------------------------- COLMAP

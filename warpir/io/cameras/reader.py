@@ -32,6 +32,13 @@ from warpir.scene.camera import Camera
 
 ASPECT_SLACK = 0.01
 """Most that a camera's picture may differ in shape from the photograph, share of its long side."""
+UPSIDE_DOWN = -0.5
+"""Height of the camera's unit up vector below which hardly a photograph is meant so."""
+ABOUT_UPSIDE_DOWN = (
+    "the camera is upside down: of a matrix in OpenCV's axes (+Y down, looking along +Z) negate "
+    "the second and third columns; a camera of a photo that EXIF turns must be turned as well; "
+    "or give --up"
+)
 
 
 def read_photo_camera(
@@ -73,6 +80,8 @@ def read_photo_camera(
         camera = replace(view.camera, assumed=())
         view = replace(view, camera=camera, world=UP_TO_Y[axis], has_up=True)
     camera = replace(view.camera, c2w=affine_matrix(view.world) @ view.camera.c2w)
+    if view.has_up and camera.c2w[1, 1] < UPSIDE_DOWN:
+        camera = replace(camera, notices=(*camera.notices, ABOUT_UPSIDE_DOWN))
     return replace(view, camera=_fit(path, camera, photo_size))
 
 
