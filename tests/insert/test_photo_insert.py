@@ -152,6 +152,11 @@ def test_i20_occluder_mask_end_to_end(inputs: Path, plain: Run, tmp_path: Path) 
     np.testing.assert_array_equal(done.image()[:, :24], photo[:, :24])
     np.testing.assert_array_equal(done.image()[:, 24:], plain.image()[:, 24:])
     assert len(done.record["inputs"]["occluder_mask"]) == 64
+    mask[:], mask[0, 0] = 255, 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    hidden = go(arguments(inputs, tmp_path / "hidden", **changes), tmp_path / "hidden")
+    (line,) = [n for n in hidden.record["notices"] if "not seen" in n]
+    assert "white stays in front" in line
 
 
 @pytest.mark.parametrize(

@@ -417,7 +417,10 @@ def _say_what_is_seen(run: Run, summary: LightSummary, picture: Picture) -> None
         "comes from there"
     )
     if not (picture.layers.matte > 0.0).any():
-        run.log.say("notice: the object is not seen in the photo")
+        masked = (
+            " (of --occluder-mask, white stays in front)" if run.inputs.occluder is not None else ""
+        )
+        run.log.notice(f"the object is not seen in the photo{masked}")
 
 
 def _measured(run: Run, light: SceneLight, summary: LightSummary) -> dict[str, Any]:
