@@ -26,11 +26,11 @@ from warpir.app.photo_world import (
     make_world,
     other_camera,
     photo_camera,
-    stand_on_ground,
 )
 from warpir.app.record import PATHS, file_hash, input_files
 from warpir.app.reuse import EarlierRun, read_run
 from warpir.app.settings import InputConfig, LightConfig
+from warpir.app.standing import stand_on_ground
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import Limits

@@ -27,9 +27,9 @@ from warpir.app.photo_world import (
     is_estimated,
     make_world,
     photo_camera,
-    stand_on_ground,
 )
 from warpir.app.settings import CameraConfig, InputConfig, LightConfig, PlacementConfig
+from warpir.app.standing import stand_on_ground
 from warpir.calibration.photos import estimate_photo
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import replacing, write_staged

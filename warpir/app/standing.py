@@ -1,0 +1,178 @@
+"""Where the object stands in the photo's world: where it was put, else on free and open ground."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from warpir.app.photo_world import PhotoWorld
+from warpir.app.settings import PlacementConfig
+from warpir.core.arrays import Float64Array
+from warpir.core.errors import InputError
+from warpir.io.images.resize import resize
+from warpir.scene.asset import Asset
+from warpir.scene.camera import Camera
+from warpir.scene.free_space import BLOCK, LOOKED_AT, OpenGround, Place, Stand, find_place
+from warpir.scene.placement import (
+    DEFAULT_STAND,
+    Placement,
+    place_asset,
+    point_on_ground,
+    settled,
+    upright_plane,
+)
+from warpir.scene.receiver import ReceiverMesh
+
+SEEN = 0.04
+"""Longest side of an object that was given no size, over the photo's height, from which it keeps
+its own where it is whole: smaller ones are hardly seen."""
+SHOWN = 0.25
+"""The same where it does not."""
+
+
+def stand_on_ground(
+    asked: PlacementConfig,
+    asset: Asset,
+    world: PhotoWorld,
+    mesh: ReceiverMesh | None = None,
+    is_plane: bool = True,
+    must_be_seen: bool = True,
+) -> Placement:
+    """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
+
+    It stands where it was asked for, or where the points leave space; a ``--place`` outside the
+    photo is refused where it must be seen.
+
+    Raises:
+        InputError: There is no such place, or no free one, or the object would be below the ground.
+    """
+    low, high = asset.bounds()
+
+    def put(place: Place | None, size: float | None = None) -> Placement:
+        return place_asset(
+            low,
+            high,
+            world.camera,
+            world.ground,
+            place=place,
+            at=asked.at if place is None else None,
+            rotate_y=asked.rotate_y,
+            scale=asked.scale,
+            size=asked.size if size is None else size,
+            mesh=mesh,
+            is_plane=is_plane,
+            must_be_seen=must_be_seen or world.place is None,
+        )
+
+    is_sized = asked.size is not None or asked.scale is not None
+    if world.place is None and asked.at is None:
+        placement = _set_free(put, asset, world, mesh, is_sized)
+    else:
+        placement = put(world.place)
+        stand = Stand(placement.asset_to_world, low, high, world.camera)
+        if world.cloud is not None and (count := len(stand.points_in_way(world.cloud))):
+            warning = f"{count} points of --ground-points stand where the object does; is it free?"
+            placement = replace(placement, warnings=(*placement.warnings, warning))
+        if not is_sized and stand.share_of_height < SEEN:
+            pixels = stand.share_of_height * world.camera.height
+            metres = float((high - low).max())
+            warning = f"with its own {metres:.3g} m the object is {pixels:.2g} pixels long (--size)"
+            placement = replace(placement, warnings=(*placement.warnings, warning))
+    return settled(
+        placement,
+        asset.corners(),
+        mesh,
+        is_plane=is_plane,
+        settles=asked.settle,
+        sink=asked.sink,
+    )
+
+
+def _set_free(
+    put: Callable[..., Placement],
+    asset: Asset,
+    world: PhotoWorld,
+    mesh: ReceiverMesh | None,
+    is_sized: bool,
+) -> Placement:
+    """Place an object that was not placed: in the lower middle, else where it is seen whole.
+
+    Without points it stands on what looks like open ground. With a mesh and no points only the
+    usual pixel is tried.
+
+    Raises:
+        InputError: There is no free place, or no ground in view.
+    """
+    low, high = asset.bounds()
+
+    def stand(place: Place | None, size: float | None = None) -> Stand:
+        return Stand(put(place, size).asset_to_world, low, high, world.camera)
+
+    if mesh is not None and world.cloud is None:
+        return put(None)
+    eye = world.camera.c2w[:3, 3]
+    plane = upright_plane(world.ground, eye)
+    ground = _open_ground(world, plane)
+    if world.cloud is None:
+        try:
+            usual = put(None)
+        except InputError:
+            pass  # above the horizon, or outside the photo: the search below tells
+        else:
+            there = Stand(usual.asset_to_world, low, high, world.camera)
+            if there.is_well_seen and (ground is None or ground.holds(there)):
+                return usual
+    own, keeps_size = float((high - low).max()), is_sized
+    lines = []
+    try:
+        place = find_place(stand, world.camera, plane, world.cloud, ground)
+    except InputError:
+        if is_sized or world.cloud is not None:
+            raise
+        # So large that the camera is inside wherever it stands: begin with what lies ahead.
+        away = 2.0 * float(plane[:3] @ eye + plane[3])
+    else:
+        placement = put(place)
+        away = float(np.linalg.norm(np.subtract(place, eye)))
+        keeps_size |= not stand(place).is_cut and stand(place).share_of_height >= SEEN
+    if not keeps_size:
+        away = min(away, _usual_distance(world.camera, plane))
+        size = float(f"{SHOWN * away * world.camera.height / world.camera.fy:.2g}")
+        place = find_place(
+            lambda there: stand(there, size), world.camera, plane, world.cloud, ground
+        )
+        placement = put(place, size)
+        lines.append(
+            f"the object is {size:g} m large, since with its own {own:.3g} m "
+            f"it would be {'hardly seen' if own < size else 'cut'} (--size, --scale)"
+        )
+    shown = ",".join(f"{round(x, 3) + 0.0:.3g}" for x in place)
+    why = "where no points are in its way"
+    if world.cloud is None:
+        there = Stand(placement.asset_to_world, low, high, world.camera)
+        why = "since the frame cuts it everywhere" if there.is_cut else "where it is seen whole"
+        if ground is not None and ground.holds(there):
+            why += ", on what looks like open ground"
+    lines.append(f"the object stands at {shown}, {why} (--at, --place)")
+    return replace(placement, assumed=(*placement.assumed, *lines))
+
+
+def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:
+    """Return how the ground looks, where no points tell what stands there."""
+    if world.photo is None or world.cloud is not None:
+        return None
+    shown = world.photo.exposed()[0]
+    share = min(1.0, LOOKED_AT / max(shown.shape[:2]))
+    height, width = (BLOCK * max(1, round(share * side / BLOCK)) for side in shown.shape[:2])
+    return OpenGround.of(resize(shown, height, width), world.camera, plane)
+
+
+def _usual_distance(camera: Camera, plane: Float64Array) -> float:
+    """Return how far away the ground of the usual pixel is [m]; infinite where there is none."""
+    pixel = DEFAULT_STAND[0] * camera.width, DEFAULT_STAND[1] * camera.height
+    try:
+        point = point_on_ground(pixel, camera, plane)
+    except InputError:
+        return math.inf
+    return float(np.linalg.norm(point - camera.c2w[:3, 3]))
