@@ -12,7 +12,7 @@ import trimesh
 
 from tests.builders.poses import pose, write_json
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import read_inputs
+from warpir.app.inputs import Loaders, read_inputs
 from warpir.app.photo_world import make_world
 from warpir.app.settings import CameraConfig
 from warpir.core.arrays import affine_matrix
@@ -395,6 +395,24 @@ def test_colmap_scene_is_set_up_from_its_files(scene: Path) -> None:
     )
     warned = read_inputs(config.changed(at=(46.0, 31.0), size=3.0))
     assert any("points of --ground-points stand where" in line for line in warned.notices)
+
+
+def test_frames_of_a_colmap_scene_share_their_ground(scene: Path) -> None:
+    """What each camera sees of the points would fit another plane: object and world would move."""
+    config = asked(scene, undistort=True, ground_points=str(scene / "sparse"), size=1.0)
+    config, loaders = config.changed(place=(0.0, 0.0, 9.0)), Loaders()
+    first, second, again = (
+        read_inputs(config.changed(frame=name), loaders)
+        for name in ("photo.png", "b.png", "photo.png")
+    )
+    moved = np.linalg.inv(first.camera.c2w) @ second.camera.c2w
+    np.testing.assert_allclose(moved[:3], [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]], atol=1e-9)
+    for other in (second, again):
+        np.testing.assert_allclose(
+            other.placement.asset_to_world, first.placement.asset_to_world, atol=1e-9
+        )
+    assert "what an earlier frame sees" in " / ".join(second.assumed)
+    assert again.assumed == first.assumed
 
 
 def test_colmap_scene_needs_its_flags(scene: Path) -> None:

@@ -46,6 +46,7 @@ from warpir.io.meshes.materials_file import with_materials
 from warpir.io.meshes.point_cloud import read_point_cloud
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
+from warpir.scene.ground import FirstGround
 from warpir.scene.light import Light
 from warpir.scene.near.lamps import Lamp, notices_of
 from warpir.scene.placement import Placement, up_to_y
@@ -94,7 +95,7 @@ class Inputs:
 
 
 class Loaders:
-    """Reads inputs; remembers the last asset, place and earlier run, for many insertions.
+    """Reads inputs; remembers the last asset, place, points with their ground, and earlier run.
 
     Args:
         estimator: Estimates the camera of a photo; None: nothing is estimated, because the inputs
@@ -108,6 +109,8 @@ class Loaders:
         self.asset: Callable[[str, str, Limits], Asset] = lru_cache(maxsize=1)(load_asset)
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
+        self.points = lru_cache(maxsize=1)(read_point_cloud)
+        self.ground = FirstGround()
         self.light = read_light
 
 
@@ -140,7 +143,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     loaders = loaders or Loaders()
     files = _read_files(config, loaders)
     try:
-        return _joined(config, files, loaders.must_be_seen)
+        return _joined(config, files, loaders)
     except InputError as error:
         other = other_camera(files.view.camera)
         if other is None:
@@ -153,18 +156,19 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
         return replace(inputs, notices=(f"{notice} ({error.what})", *inputs.notices))
 
 
-def _joined(config: InsertConfig, files: _Files, must_be_seen: bool) -> Inputs:
+def _joined(config: InsertConfig, files: _Files, loaders: Loaders) -> Inputs:
     """Set the object into the photo's world.
 
     Raises:
         InputError: There is no place for it, or no ground.
     """
     straight, undistorted_by = _straightened(files)
-    world = make_world(config.camera, config.placement.place, files.view, files.points)
+    ask, place = config.camera, config.placement.place
+    world = make_world(ask, place, files.view, files.points, loaders.ground)
     world = replace(world, photo=straight.photo)
     mesh = None if files.proxy is None else mesh_of(files.proxy)
     placement = stand_on_ground(
-        config.placement, files.asset, world, mesh, config.camera.plane, must_be_seen
+        config.placement, files.asset, world, mesh, config.camera.plane, loaders.must_be_seen
     )
     shade = None
     if straight.shaded is not None:
@@ -230,7 +234,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     pose = view.camera.c2w if view is not None else np.eye(4)
     light = attempt(lambda: loaders.light(given, inputs.strict, pose, limits, log))
     if (points_path := config.camera.ground_points) is not None:
-        points = attempt(lambda: read_point_cloud(points_path, limits))
+        points = attempt(lambda: loaders.points(points_path, limits))
     if (proxy_path := config.camera.proxy) is not None:
         proxy = attempt(lambda: loaders.proxy(proxy_path, limits))
     lamps = attempt(lambda: given_lamps(given.lamp, given.lamps, limits, log.notice)) or ()
@@ -238,7 +242,9 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     raise_all(problems)
     assert photo is not None and asset is not None and view is not None
     hashes = {name: file_hash(path) for name, (path, _) in states.items()}
-    raise_all([_changed(path) for path, before in states.values() if file_state(path) != before])
+    changed = [path for path, before in states.values() if file_state(path) != before]
+    advice = "run again when it is complete"
+    raise_all([InputError(path, "changed while it was read", advice) for path in changed])
     hashes |= _hashes_beside(config, asset, proxy)
     if run is not None:
         hashes["reuse"] = run.digest
@@ -313,10 +319,8 @@ def _assumptions(
             f"{100.0 * shade.at_object:.0f} % of the light of the sun and of far lamps is kept "
             "from the object, the mean of --shadow-mask under its footprint"
         )
-    if files.run is not None:
-        assumption = files.run.assumption(world.camera.c2w, config.camera.file)
-        if assumption:
-            yield assumption
+    if (run := files.run) and (line := run.assumption(world.camera.c2w, config.camera.file)):
+        yield line
 
 
 def _notices(
@@ -389,10 +393,6 @@ def file_state(path: Path) -> _State | None:
     except (OSError, ValueError):  # the reader tells
         return None
     return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _changed(path: Path) -> InputError:
-    return InputError(path, "changed while it was read", "run again when it is complete")
 
 
 def _inputs_in_out(config: InsertConfig) -> list[InputError]:

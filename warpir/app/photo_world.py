@@ -25,10 +25,8 @@ from warpir.scene.camera import (
     camera_pose,
     horizon_row,
 )
-from warpir.scene.free_space import (
-    Cloud,
-)
-from warpir.scene.ground import fit_ground
+from warpir.scene.free_space import Cloud
+from warpir.scene.ground import GroundFit, fit_ground
 from warpir.scene.placement import (
     STEEP,
     upright_plane,
@@ -269,11 +267,13 @@ def make_world(
     place: tuple[float, float, float] | None,
     view: PhotoCamera,
     points: Float64Array | None,
+    fitted: Callable[..., GroundFit] = fit_ground,
 ) -> PhotoWorld:
     """Find the ground in the points, and level a world whose up is not known by its ground.
 
     The points, shape [point, 3], are in the world of the camera's file, and so are ground and
-    ``place`` where its up is unknown; ``view`` says how that was turned.
+    ``place`` where its up is unknown; ``view`` says how that was turned. ``fitted`` is called as
+    `fit_ground`.
 
     Raises:
         InputError: No ground in the points, nothing that tells which way is up, or a ground that
@@ -283,7 +283,7 @@ def make_world(
     fit = None
     if points is not None:
         points = points @ view.world.T
-        fit = fit_ground(points, camera, has_up=view.has_up)
+        fit = fitted(points, camera, has_up=view.has_up)
         ground = _four(fit.plane)
     notices = _about_turn(asked, place, view)
     if not view.has_up:

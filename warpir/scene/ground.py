@@ -5,6 +5,7 @@ distances, cut off at a threshold), the best is refined by total least squares o
 """
 
 from dataclasses import dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 
@@ -45,10 +46,17 @@ class GroundFit:
     """Height of the camera above the plane [m]."""
     has_up: bool = True
     """Whether the world's up was known."""
+    is_earlier: bool = False
+    """Whether all but the height is of an earlier frame's camera."""
 
     @property
     def about(self) -> str:
         """Summary of the fit in one line."""
+        if self.is_earlier:
+            return (
+                "the ground is the plane fitted to what an earlier frame sees of the points, "
+                f"{self.camera_height:.3g} m below this camera (--ground-points)"
+            )
         share = 100.0 * self.inliers / self.points
         level = "level" if self.has_up else "the camera's"
         return (
@@ -132,6 +140,27 @@ def _fit(
         return None
     rms = float(np.sqrt(np.mean(distances[near] ** 2)))
     return GroundFit(plane, rms, int(near.sum()), len(points), tilt, height)
+
+
+class FirstGround:
+    """Fits one plane to the same points, to those that the first camera sees.
+
+    Each camera of a sequence sees others, and planes of their own would let the object tremble.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[bytes, tuple[GroundFit, Float64Array]] = {}
+
+    def __call__(self, points: Float64Array, camera: Camera, *, has_up: bool = True) -> GroundFit:
+        """Return the first fit to such points; arguments as of `fit_ground`."""
+        key = sha256(points.tobytes()).digest()
+        if key not in self._found:
+            self._found[key] = fit_ground(points, camera, has_up=has_up), camera.c2w
+        fit, first = self._found[key]
+        if np.array_equal(first, camera.c2w):
+            return fit
+        height = float(fit.plane[:3] @ camera.c2w[:3, 3] + fit.plane[3])
+        return replace(fit, camera_height=height, is_earlier=True)
 
 
 def in_view(points: Float64Array, camera: Camera) -> BoolArray:
