@@ -397,6 +397,17 @@ def test_colmap_scene_is_set_up_from_its_files(scene: Path) -> None:
     assert any("points of --ground-points stand where" in line for line in warned.notices)
 
 
+def test_two_runs_in_a_colmap_scene_share_their_world(scene: Path) -> None:
+    """Each fits its own ground, COLMAP's up is about -Y, and the light of one is the other's."""
+    config = asked(scene, undistort=True, ground_points=str(scene / "sparse"), size=1.0)
+    first, second = (
+        read_inputs(config.changed(frame=name)).camera.c2w[:3, :3]
+        for name in ("photo.png", "b.png")
+    )
+    np.testing.assert_allclose(second, first, atol=np.radians(1.0))
+    np.testing.assert_allclose(first, np.eye(3), atol=np.radians(1.0))
+
+
 def test_frames_of_a_colmap_scene_share_their_ground(scene: Path) -> None:
     """What each camera sees of the points would fit another plane: object and world would move."""
     config = asked(scene, undistort=True, ground_points=str(scene / "sparse"), size=1.0)

@@ -10,7 +10,15 @@ from warpir.core.arrays import Float64Array, IntArray
 from warpir.core.errors import InputError
 from warpir.scene.asset import Asset, Material, Primitive
 from warpir.scene.camera import Camera, camera_from_fov
-from warpir.scene.placement import place_asset, settled, turn, up_to_y, upright_plane, y_to
+from warpir.scene.placement import (
+    levelled,
+    place_asset,
+    settled,
+    turn,
+    up_to_y,
+    upright_plane,
+    y_to,
+)
 from warpir.scene.receiver import ReceiverMesh
 
 # float64 and a handful of products
@@ -104,6 +112,18 @@ def test_placement_rotation_to_straight_down() -> None:
     rotation = y_to(np.array([0.0, -1.0, 0.0]))
     np.testing.assert_allclose(rotation[:, 1], (0.0, -1.0, 0.0), atol=EXACT)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=EXACT)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z", "-x", "-y", "-z"])
+def test_levelling_hardly_changes_with_the_normal(axis: str) -> None:
+    """Near each axis it is about the turn of that axis; the smallest one turns over near -Y."""
+    up = up_to_y(axis).T @ [0.0, 1.0, 0.0]
+    for normal in up + np.random.default_rng(3).normal(0.0, 0.01, (8, 3)):
+        normal /= np.linalg.norm(normal)
+        rotation = levelled(normal)
+        np.testing.assert_allclose(rotation @ normal, [0, 1, 0], atol=EXACT)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=EXACT)
+        np.testing.assert_allclose(rotation, up_to_y(axis), atol=0.05)
 
 
 def test_placement_says_what_it_assumed(camera: Camera) -> None:

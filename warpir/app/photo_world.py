@@ -29,8 +29,8 @@ from warpir.scene.free_space import Cloud
 from warpir.scene.ground import GroundFit, fit_ground
 from warpir.scene.placement import (
     STEEP,
+    levelled,
     upright_plane,
-    y_to,
 )
 
 DEFAULT_FOV = 60.0
@@ -294,7 +294,7 @@ def make_world(
                 "give --ground-points with its points, or --ground, or --up",
             )
         plane = upright_plane(ground, camera.c2w[:3, 3])
-        level = y_to(plane[:3]).T
+        level = levelled(plane[:3])
         camera = replace(camera, c2w=affine_matrix(level) @ camera.c2w)
         ground = _four(np.append(level @ plane[:3], plane[3]))
         if place is not None:

@@ -369,6 +369,18 @@ def up_to_y(axis: str) -> Float64Array:
     return y_to(up).T
 
 
+def levelled(normal: Float64Array) -> Float64Array:
+    """Return a rotation from a unit vector to +Y, which hardly changes with it, shape [3, 3].
+
+    It goes by way of the axis closest to the vector: the smallest rotation from near -Y, where
+    most COLMAP worlds have their up, turns about any axis for the last digits of it.
+    """
+    axis = int(np.abs(normal).argmax())
+    to_y = up_to_y(("-" if normal[axis] < 0.0 else "+") + "xyz"[axis])
+    rotation: Float64Array = y_to(to_y @ normal).T @ to_y
+    return rotation
+
+
 def turn(axis: Float64Array, angle: float) -> Float64Array:
     """Return the right-handed rotation about a unit axis by an angle [rad], shape [3, 3]."""
     x, y, z = (float(component) for component in axis)
