@@ -166,6 +166,19 @@ def stop_at_the_second_picture(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
+def test_frames_left_by_a_longer_sequence_are_told(
+    frames: tuple[list[str], Path], inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They stay, but a player of all folders would show them behind the last frame."""
+    argv, done = frames
+    out = shutil.copytree(done, tmp_path / "out")
+    lines = write_lines(tmp_path / "s.jsonl", [FRAMES[0]], inputs)
+    argv = [*argv, "--sequence", str(lines), "--out", str(out)]
+    assert main(argv) == ExitCode.DONE
+    assert f"notice: {out} still holds 0002 to 0003, of a longer" in capsys.readouterr().out
+    assert (out / "0003" / "run.json").exists()
+
+
 def test_interrupted_sequence_goes_on(
     frames: tuple[list[str], Path],
     tmp_path: Path,

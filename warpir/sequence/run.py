@@ -61,8 +61,20 @@ def insert_frames(
     if config.output.report:  # before the summary, by which others see that nothing is left to do
         attempt(PAGE, lambda: write_sequence_report(config, frames))
     record = write_summary(config, frames, say)
+    _say_left_over(config.output.folder, frames)
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
     return config.output.folder, (*composites, *record["video"], SUMMARY), record
+
+
+def _say_left_over(out: Path, frames: tuple[Frame, ...]) -> None:
+    """Say which folders of a longer sequence before are there: other programs would show them."""
+    found = {path.parent.name for path in out.glob("[0-9][0-9][0-9][0-9]/run.json")}
+    if left := sorted(found - {frame.folder.name for frame in frames}):
+        names = left[0] if len(left) == 1 else f"{left[0]} to {left[-1]}"
+        say(
+            f"notice: {out} still holds {names}, of a longer sequence before: {len(left)} "
+            f"{'folder is' if len(left) == 1 else 'folders are'} no part of this one"
+        )
 
 
 def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -> tuple[Frame, ...]:
