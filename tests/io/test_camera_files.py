@@ -485,6 +485,16 @@ def test_gltf_camera_projects_as_gltf_says(
     assert any("aspect" in n for n in view.camera.notices) == (size != (640, 480))
 
 
+@pytest.mark.parametrize(("node", "is_told"), [(0, True), (1, True), (2, False)])
+def test_gltf_camera_that_is_animated_says_so(tmp_path: Path, node: int, is_told: bool) -> None:
+    """The track of a shot is not played: itself or its parent; another camera's is its own."""
+    target = {"node": node, "path": "translation"}
+    moved = {"channels": [{"sampler": 0, "target": target}], "samplers": []}
+    path = write_glb(tmp_path / "shot.glb", gltf_scene(np.eye(4)) | {"animations": [moved]})
+    notices = read_photo_camera(path, SIZE, frame="lens").camera.notices
+    assert any("animated" in notice for notice in notices) == is_told
+
+
 @pytest.mark.case("C6")
 def test_C6_gltf_camera_is_named_before_it_is_counted(
     tmp_path: Path, rng: np.random.Generator

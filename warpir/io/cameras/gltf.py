@@ -59,9 +59,27 @@ def read_gltf_camera(
             f"{width / height:.4g}: its vertical angle is kept"
         )
     focal = height / 2.0 / float(np.tan(yfov / 2.0))
-    c2w = _unscaled(placed[k], _world(nodes, parents, nodes.index(placed[k])))
+    index = nodes.index(placed[k])
+    if _is_animated(root, parents, index):
+        notices.append(
+            "the camera of the glTF file is animated, which is not played: its rest pose is used "
+            "(give each frame of a film a file of its own, a COLMAP model or a transforms.json)"
+        )
+    c2w = _unscaled(placed[k], _world(nodes, parents, index))
     camera = Camera(width, height, focal, focal, width / 2.0, height / 2.0, c2w, tuple(notices))
     return PhotoCamera(camera)
+
+
+def _is_animated(root: Entry, parents: dict[int, int], index: int) -> bool:
+    """Return whether an animation moves a node, or one that it hangs from."""
+    moved = {
+        channel.child("target").integer("node", -1, low=-1)
+        for animation in root.items("animations")
+        for channel in animation.items("channels")
+    }
+    while index not in moved and index in parents:
+        index = parents[index]
+    return index in moved
 
 
 def _world(nodes: list[Entry], parents: dict[int, int], index: int) -> Float64Array:
