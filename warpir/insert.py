@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig, usage
-from warpir.app.program import attempt, require_packages, run_program, say, stay_offline
+from warpir.app.program import attempt, extras_of, require_packages, run_program, say, stay_offline
 from warpir.core.errors import ExitCode
 from warpir.core.limits import LIMITS
 from warpir.core.memory import Memory, no_collection, sparing, trim
@@ -150,7 +150,7 @@ def _read(
     from warpir.optimize.checkpoint import output_folder
 
     log, timings = Log(say), Timings()
-    require_packages(*(("pxr",) if config.output.usd else ()))
+    require_packages(*extras_of(config))
     with no_collection(), timings.stage("read"):
         if config.inputs.demo:
             from warpir.demo import demo_config
@@ -202,9 +202,8 @@ def _run(arguments: list[str]) -> int:
     command = parse(arguments)
     for notice in command.notices:
         say(f"notice: {notice}")
-    guides = ("diffusers", "transformers", "peft") if command.config.is_guided else ()
-    require_packages("warp", "torch", *guides)
-    if guides and sys.flags.optimize > 1:
+    require_packages("warp", "torch", *extras_of(command.config))
+    if command.config.is_guided and sys.flags.optimize > 1:
         advice = "run without -OO and PYTHONOPTIMIZE=2"
         raise usage("python -OO", "the model's libraries need their docstrings", advice)
     if command.validate:

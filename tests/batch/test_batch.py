@@ -26,13 +26,13 @@ import pytest
 from tests.builders.faults import snapshot
 from tests.builders.insertions import arguments, record_of, write_inputs
 from warpir.app.command import parse
-from warpir.app.config import DEFAULTS
+from warpir.app.config import DEFAULTS, InsertConfig
 from warpir.batch import run as batch
 from warpir.batch.command import main
 from warpir.batch.local import LocalWorkers, answer_of_the_dead
 from warpir.batch.manifest import Row, read_manifest
 from warpir.batch.ray import RayWorkers, _probe
-from warpir.batch.task import COMPILE, INSERT, Answer, Task
+from warpir.batch.task import CHECK, COMPILE, INSERT, Answer, Task, do_task
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.limits import LIMITS
 from warpir.core.signals import Stopped
@@ -346,6 +346,19 @@ def test_validate_looks_at_all_lines_and_writes_nothing(
     assert set(states_of(out).values()) == {"not run", "failed"} and len(failures_of(out)) == 3
     write_manifest(memory, scenes(2))
     assert main([*argv, "--validate"]) == ExitCode.DONE
+
+
+@pytest.mark.parametrize("row", [{"demo": True}, {"sequence": "s", "asset": "a", "reuse": "r"}])
+def test_an_extra_that_is_not_installed_is_told_by_the_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row: dict[str, Any]
+) -> None:
+    """Before any scene is done, as `insert` does it."""
+    monkeypatch.setattr(
+        "warpir.app.program.importlib.util.find_spec", lambda name: name != "pxr" or None
+    )
+    config = InsertConfig(**row, usd=True, out=str(tmp_path / "out"))
+    answer = do_task(Task(CHECK, config.flat(), str(tmp_path)))
+    assert (answer.status, answer.lines[0]) == (ExitCode.USAGE, "error: pxr: not installed")
 
 
 def read(path: Path, **given: Any) -> tuple[Row, ...]:

@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from warpir.app.config import usage
+from warpir.app.config import InsertConfig, usage
 from warpir.core import signals
 from warpir.core.atomic import WriteError
 from warpir.core.errors import DISK_FULL, LISTED, ExitCode, InputError, disk_error
@@ -112,6 +112,12 @@ def require_packages(*names: str) -> None:
     for name in names:
         if importlib.util.find_spec(name) is None:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+def extras_of(config: InsertConfig) -> tuple[str, ...]:
+    """Return the packages of extras that an insertion imports late; for `require_packages`."""
+    of_model = ("diffusers", "transformers", "peft") if config.is_guided else ()
+    return (*of_model, *(("pxr",) if config.output.usd else ()))
 
 
 def _require_process() -> None:

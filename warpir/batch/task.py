@@ -19,7 +19,7 @@ from typing import Any
 from warpir.app.config import InsertConfig
 from warpir.app.finished import OtherRun, config_of_record, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
-from warpir.app.program import explain, say, stay_offline
+from warpir.app.program import explain, extras_of, require_packages, say, stay_offline
 from warpir.app.run import memory_needs, needed_bytes, require_space
 from warpir.core import signals
 from warpir.core.errors import ExitCode, InputError, disk_errors
@@ -109,6 +109,7 @@ def do_task(task: Task) -> Answer:
 
 def _check(task: Task) -> dict[str, Any]:
     config = config_of_record(task.config)
+    require_packages(*extras_of(config))
     if config.task.sequence is not None:
         return _check_sequence(config)
     filled = _filled(config)
