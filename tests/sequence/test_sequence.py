@@ -294,7 +294,8 @@ def test_changed_inputs_are_noticed(
     argv = argv_of(inputs, first, lines, tmp_path / "out", photo=str(tmp_path / "photo.png"))
     assert main(argv) == ExitCode.DONE
     (tmp_path / "photo.png").write_bytes((inputs / "deep.png").read_bytes())
-    assert_fails(capsys, argv, ExitCode.OUTPUT, "s.jsonl:1:", "other settings or other files")
+    found = assert_fails(capsys, argv, ExitCode.OUTPUT, "s.jsonl:1:", "other settings or other")
+    assert "remove that folder" in found[1]  # --overwrite would render all frames again
 
 
 BAD_LINES: list[tuple[object, str]] = [

@@ -120,9 +120,10 @@ def _looked_up(frame: Frame, renews: bool) -> Frame:
     """Return a frame that knows what is in its folder."""
     try:
         return replace(frame, is_done=is_done(frame.config))
-    except OtherRun:
+    except OtherRun as error:
         if not renews:
-            raise
+            advice = "remove that folder to render the frame again; --overwrite renders all again"
+            raise InputError(error.where, error.what, advice, error.code) from error
         return replace(frame, config=frame.config.changed(overwrite=True))
 
 
