@@ -122,6 +122,15 @@ def test_frame_is_the_single_runs_twin(
         assert frame["files"][name] == replayed.record["files"][name]
 
 
+def test_a_long_check_says_how_far_it_is(
+    frames: tuple[list[str], Path], monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """Large frames are read for minutes before the first is rendered."""
+    monkeypatch.setattr("warpir.sequence.run.LINE_SECONDS", 0.0)
+    assert main([*frames[0], "--validate"]) == ExitCode.DONE
+    assert "checked: frames up to 0003" in capsys.readouterr().out
+
+
 def test_finished_frames_are_left_alone(
     frames: tuple[list[str], Path],
     monkeypatch: pytest.MonkeyPatch,
@@ -195,7 +204,9 @@ def test_interrupted_sequence_goes_on(
     assert not (tmp_path / "out" / "0002").exists()
     assert not (tmp_path / "out" / "sequence.json").exists()
     assert main(argv) == ExitCode.DONE
-    assert len(calls) == 4 and "frame 0001: done already" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert len(calls) == 4 and "frame 0001: done already" in said
+    assert "frame 0003: line 4 of" in said and ", 1 of 2 rendered, about " in said
     for folder in ("0001", "0002", "0003"):
         one, other = (record_of(o / folder)["files"] for o in (finished, tmp_path / "out"))
         assert one["composite.png"] == other["composite.png"]

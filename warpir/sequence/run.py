@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from warpir.app.config import InsertConfig
 from warpir.app.inputs import Inputs, Loaders
 from warpir.app.program import attempt, say
 from warpir.calibration.photos import FirstPhoto
+from warpir.core.progress import LINE_SECONDS, duration
 from warpir.core.signals import Stopped
 from warpir.io.results import OutputFolder
 from warpir.sequence.frames import SUMMARY, Frame, read_sequence, write_summary
@@ -42,16 +44,22 @@ def insert_frames(
     """
     loaders = Loaders(FirstPhoto(), must_be_seen=False)
     frames = _read_frames(config, loaders, renews)
-    done = 0
+    done, rendered, began = 0, 0, time.monotonic()
+    todo = sum(not frame.is_done for frame in frames)
     try:
         for frame in frames:
             if frame.is_done:
                 say(f"frame {frame.folder.name}: done already")
             else:
-                say(f"frame {frame.folder.name}: line {frame.line} of {config.task.sequence}")
+                line = f"frame {frame.folder.name}: line {frame.line} of {config.task.sequence}"
+                if rendered:
+                    left = (time.monotonic() - began) / rendered * (todo - rendered)
+                    line += f", {rendered} of {todo} rendered, {duration(left)} left"
+                say(line)
                 if frame.config.output.overwrite and not config.output.overwrite:
                     say("notice: its settings or inputs have changed: it is rendered again")
                 insert_one(frame.config, loaders)
+                rendered += 1
             done += 1
     except Stopped as error:
         done += bool(error.kept)  # the signal came while this frame's results were put in place
@@ -84,8 +92,13 @@ def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -
         InputError: A line or a frame cannot be used, or there is another page.
     """
     poses: set[bytes] = set()
+    told = time.monotonic()
 
     def look_at(frame: Frame, inputs: Inputs) -> None:
+        nonlocal told
+        if time.monotonic() - told >= LINE_SECONDS:
+            told = time.monotonic()
+            say(f"checked: frames up to {frame.folder.name}")
         if frame.config.placement.place is None and "at" not in frame.changed:
             poses.add(inputs.camera.c2w.tobytes())
 
