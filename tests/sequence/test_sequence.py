@@ -403,6 +403,20 @@ def test_object_that_follows_the_camera_is_said(
     assert ("it moves with the camera" in capsys.readouterr().out) == moves
 
 
+@pytest.mark.parametrize(("tracked", "is_told"), [(1, True), (2, False), (0, False)])
+def test_a_frame_without_the_camera_of_the_others_is_told(
+    inputs: Path, first: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    tracked: int, is_told: bool,
+) -> None:  # fmt: skip
+    """A tracker that loses a frame leaves a gap; another camera would let the object jump."""
+    known = {"camera": str(first.out / "camera.json"), "place": [0, 0, -5]}
+    lines = [known] * tracked + [{"fov": 60, "place": [0, 0, -5]}] * (2 - tracked)
+    path = write_lines(tmp_path / "s.jsonl", lines, inputs)
+    argv = argv_of(inputs, first, path, tmp_path / "out", horizon=None, fov=None)
+    assert main([*argv, "--validate"]) == ExitCode.DONE
+    assert ("notice: line 2 of 2 has no --camera" in capsys.readouterr().out) == is_told
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -86,7 +86,7 @@ def _say_left_over(out: Path, frames: tuple[Frame, ...]) -> None:
 
 
 def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -> tuple[Frame, ...]:
-    """Read all frames, as `read_sequence`, and say where an object would follow the camera.
+    """Read all frames, as `read_sequence`, and say where an object would not stay in its place.
 
     Raises:
         InputError: A line or a frame cannot be used, or there is another page.
@@ -108,6 +108,13 @@ def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -
         say(
             f"notice: the camera moves, and the object is set {how} in each frame anew: it moves "
             "with the camera (--place keeps it where it stands)"
+        )
+    alone = [frame.line for frame in frames if frame.config.camera.file is None]
+    if 0 < len(alone) < len(frames):
+        more = f" and {len(alone) - 1} more" if len(alone) > 1 else ""
+        say(
+            f"notice: line {alone[0]}{more} of {len(frames)} has no --camera, as others have: what "
+            "stands for it is in a world of its own, and the object jumps there"
         )
     refuse_other_page(config)
     return frames
