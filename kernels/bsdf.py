@@ -27,7 +27,6 @@ from warpir.kernels.sampling import cosine_sample
 from warpir.kernels.types import Layers
 
 INV_PI = wp.constant(0.318309886183791)
-PI = wp.constant(3.14159265358979)
 ALPHA_MIN = wp.constant(1.0e-3)
 """Below this the lobe is narrower than float32 directions resolve; the specification allows it."""
 F0_DIELECTRIC = wp.constant(0.04)
@@ -81,7 +80,7 @@ def ggx_d(wm: wp.vec3, alpha: float) -> float:
     x = wm[0] / alpha
     y = wm[1] / alpha
     s = x * x + y * y + wm[2] * wm[2]
-    return 1.0 / (PI * alpha * alpha * s * s)
+    return 1.0 / (wp.PI * alpha * alpha * s * s)
 
 
 @wp.func
@@ -397,7 +396,7 @@ def coat_lobe(wo: wp.vec3, wi: wp.vec3, coat_n: wp.vec3, roughness: float) -> wp
 def visible_normal_sample(wo: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     """Draw a microfacet normal visible from ``wo`` of any length (Dupuy & Benyoub 2023, 1)."""
     stretched = wp.normalize(wp.vec3(alpha * wo[0], alpha * wo[1], wo[2]))
-    phi = 2.0 * PI * u[0]
+    phi = 2.0 * wp.PI * u[0]
     z = (1.0 - u[1]) * (1.0 + stretched[2]) - stretched[2]
     s = wp.sqrt(wp.clamp(1.0 - z * z, 0.0, 1.0))
     h = wp.vec3(s * wp.cos(phi), s * wp.sin(phi), z) + stretched

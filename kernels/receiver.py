@@ -13,7 +13,7 @@ from functools import cache
 
 import warp as wp
 
-from warpir.kernels.bsdf import smith_lambda, visible_normal_sample
+from warpir.kernels.bsdf import INV_PI, smith_lambda, visible_normal_sample
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
 from warpir.kernels.maths.lanes import lane_sum
@@ -43,8 +43,6 @@ from warpir.kernels.types import (
 )
 
 wp.set_module_options({"enable_backward": False})
-
-INV_PI = wp.constant(0.318309886183791)
 
 LIGHT_RAYS = wp.constant(2)
 """Directions of the light for each from `object_window` in `trace_plane_shadow`: half shadows hold

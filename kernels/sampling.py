@@ -14,8 +14,6 @@ from warpir.kernels.maths.rng import hash_pair, pixel_seed, to_unit
 from warpir.kernels.maths.sg import sg_shape
 from warpir.kernels.types import DrawnLight, LightArgs
 
-PI = wp.constant(3.14159265358979)
-
 
 @wp.func
 def power_heuristic(pdf: float, pdf_other: float) -> float:
@@ -31,7 +29,7 @@ def power_heuristic(pdf: float, pdf_other: float) -> float:
 def cosine_sample(u: wp.vec2) -> wp.vec3:
     """Draw a direction with density ``cos / pi`` around local z."""
     r = wp.sqrt(u[0])
-    phi = 2.0 * PI * u[1]
+    phi = 2.0 * wp.PI * u[1]
     return wp.vec3(r * wp.cos(phi), r * wp.sin(phi), wp.sqrt(wp.max(1.0 - u[0], 0.0)))
 
 
@@ -61,7 +59,7 @@ def lobe_sample(u: wp.vec2, axis: wp.vec3, sharpness: float) -> wp.vec3:
     t = minus_log_one_minus(u[0] * one_minus_exp(2.0 * sharpness)) / sharpness
     t = wp.clamp(t, 0.0, 2.0)
     s = wp.sqrt(t * (2.0 - t))
-    phi = 2.0 * PI * u[1]
+    phi = 2.0 * wp.PI * u[1]
     local = wp.vec3(s * wp.cos(phi), s * wp.sin(phi), 1.0 - t)
     return wp.normalize(to_world(local, basis(axis)))
 
@@ -91,7 +89,7 @@ def light_eval(light: LightArgs, wi: wp.vec3) -> LightValue:
             # The sampler works in (u, v): d_omega = 2 pi^2 sin(theta) du dv.
             s = wp.max(wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2]), 1.0e-7)
             density = map_scalar(light.texel_prob, tap) * float(light.map_height * light.map_width)
-            pdf += density / (2.0 * PI * PI * s)
+            pdf += density / (2.0 * wp.PI * wp.PI * s)
     value.radiance = L
     value.pdf = pdf
     return value
@@ -249,6 +247,6 @@ def sum_plane(drawn: wp.array2d[DrawnLight], normal: wp.vec3, sums: wp.array[wp.
         # A NaN counts, and is seen.
         if sample.pdf != 0.0:
             cosine = wp.max(wp.dot(sample.wi, normal), 0.0)
-            arriving = sample.radiance * (cosine / (PI * sample.pdf))
+            arriving = sample.radiance * (cosine / (wp.PI * sample.pdf))
             total += wp.vec3d(arriving)
     sums[i] = total

@@ -11,13 +11,12 @@ lamp, and solid glass, through which no direction can be drawn. Detached.
 
 import warp as wp
 
-from warpir.kernels.bsdf import Bsdf, bsdf_f
+from warpir.kernels.bsdf import INV_PI, Bsdf, bsdf_f
 from warpir.kernels.lamps.gather import free_distance
 from warpir.kernels.lamps.solid_angle import rectangle_seen
 from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
 from warpir.kernels.receiver import (
-    INV_PI,
     object_ray,
     object_window,
     receiver_origin,
@@ -39,7 +38,6 @@ from warpir.kernels.types import (
 
 wp.set_module_options({"enable_backward": False})
 
-TWO_PI = wp.constant(6.28318530717959)
 RIM_KEY = wp.constant(wp.uint32(0x85EBCA6B))
 """Keeps the draws on rims apart from all others."""
 
@@ -73,12 +71,12 @@ def rim_point(lamps: LampArgs, k: int, p: wp.vec3, u: wp.vec2) -> RimPoint:
         sine = r / away
         out.distance = wp.sqrt((away - r) * (away + r))
         cosine = out.distance / away
-        phi = TWO_PI * u[0]
+        phi = wp.TAU * u[0]
         across = wp.vec3(wp.cos(phi), wp.sin(phi), 0.0)
         frame = basis(v / away)
         out.wi = wp.normalize(to_world(across * sine + wp.vec3(0.0, 0.0, cosine), frame))
         outward = to_world(across * cosine - wp.vec3(0.0, 0.0, sine), frame)
-        out.speed = outward * (TWO_PI * sine / out.distance)
+        out.speed = outward * (wp.TAU * sine / out.distance)
         out.valid = 1
         return out
     if rectangle_seen(lamps, k, p).z0 == 0.0:

@@ -7,10 +7,11 @@ halves share them, so the ratio is exactly 1 where nothing is blocked. Detached.
 
 import warp as wp
 
+from warpir.kernels.bsdf import INV_PI
 from warpir.kernels.lamps.gather import LAMP_KEY, free_distance
 from warpir.kernels.lamps.solid_angle import lamps_sample, pick_total
 from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
-from warpir.kernels.receiver import INV_PI, receiver_origin, receiver_point
+from warpir.kernels.receiver import receiver_origin, receiver_point
 from warpir.kernels.tracing.ray import visibility_within
 from warpir.kernels.types import (
     CameraArgs,

@@ -13,7 +13,6 @@ from warpir.kernels.types import LampArgs
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979)
 SMALL_ANGLE = wp.constant(0.03)
 """Solid angle of a rectangle up to which its area is sampled [sr]; 4 angles of float32 err by
 10^-6."""
@@ -74,7 +73,7 @@ def rectangle_seen(lamps: LampArgs, k: int, p: wp.vec3) -> Rectangle:
     g3 = corner_angle(q.z0, -q.y0, q.z0, -q.x0)
     q.b0 = -q.y0 / wp.sqrt(q.z0 * q.z0 + q.y0 * q.y0)
     q.b1 = q.y1 / wp.sqrt(q.z0 * q.z0 + q.y1 * q.y1)
-    q.k = 2.0 * PI - g2 - g3
+    q.k = 2.0 * wp.PI - g2 - g3
     q.solid_angle = g0 + g1 - q.k
     if q.solid_angle < SMALL_ANGLE:
         # Of the middle: what is drawn over the area needs a share that is not 0, no more.
@@ -102,7 +101,7 @@ def pick_weight(lamps: LampArgs, k: int, p: wp.vec3) -> float:
     """Return luminance times solid angle of lamp ``k`` as seen from ``p``."""
     if lamps.is_rectangle[k] == 1:
         return lamps.brightness[k] * rectangle_seen(lamps, k, p).solid_angle
-    return lamps.brightness[k] * 2.0 * PI * one_minus_cosine(lamps, k, p)
+    return lamps.brightness[k] * 2.0 * wp.PI * one_minus_cosine(lamps, k, p)
 
 
 @wp.func
@@ -135,7 +134,7 @@ def sphere_point(lamps: LampArgs, k: int, p: wp.vec3, u: wp.vec2) -> LampPoint:
     v = lamps.center[k] - p
     t = u[0] * spread
     sine = wp.sqrt(wp.max(t * (2.0 - t), 0.0))
-    phi = 2.0 * PI * u[1]
+    phi = 2.0 * wp.PI * u[1]
     local = wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - t)
     away = wp.length(v)
     axis = wp.vec3(0.0, 0.0, 1.0)
@@ -145,7 +144,7 @@ def sphere_point(lamps: LampArgs, k: int, p: wp.vec3, u: wp.vec2) -> LampPoint:
     b = away * (1.0 - t)
     half = wp.sqrt(wp.max(lamps.radius[k] * lamps.radius[k] - away * sine * away * sine, 0.0))
     out.distance = wp.where(spread == 2.0, b + half, wp.max(b - half, 0.0))
-    out.pdf = 1.0 / (2.0 * PI * spread)
+    out.pdf = 1.0 / (2.0 * wp.PI * spread)
     out.valid = 1
     return out
 
@@ -222,7 +221,7 @@ def lamp_along(lamps: LampArgs, k: int, p: wp.vec3, wi: wp.vec3) -> LampPoint:
     if rest >= 0.0 and (b > 0.0 or spread == 2.0):
         half = wp.sqrt(rest)
         out.distance = wp.where(spread == 2.0, b + half, wp.max(b - half, 0.0))
-        out.pdf = 1.0 / (2.0 * PI * spread)
+        out.pdf = 1.0 / (2.0 * wp.PI * spread)
         out.valid = 1
     return out
 

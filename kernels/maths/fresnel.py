@@ -11,7 +11,6 @@ import math
 
 import warp as wp
 
-PI = wp.constant(math.pi)
 _RADIANS = 2e-9 * math.pi
 """Phase over path times wave number, with the path in nm [rad m/nm]."""
 
@@ -101,9 +100,9 @@ def film_fresnel(f0: wp.vec3, ior: float, thickness: float, cos_d: float) -> wp.
         C1[k] = 2.0 * (Rs - T121) * wp.sqrt(R123)
         C2[k] = 2.0 * (Rs - T121) * R123
         # Light turns by half a wave where it meets the higher index: outside, and at the base.
-        shift[k] = PI
+        shift[k] = wp.PI
         if base < ior:
-            shift[k] = 2.0 * PI
+            shift[k] = 2.0 * wp.PI
     path = 2.0 * ior * thickness * cos_in
     out = C0 + wp.cw_mul(C1, seen_wave(path, shift))
     out += wp.cw_mul(C2, seen_wave(2.0 * path, 2.0 * shift))

@@ -6,8 +6,6 @@ centre at ``u = (j + 0.5) / We``, ``v = (i + 0.5) / He``; longitude wraps, latit
 
 import warp as wp
 
-PI = wp.constant(3.14159265358979)
-
 
 @wp.func
 def arc_tangent(y: float, x: float) -> float:
@@ -23,9 +21,9 @@ def arc_tangent(y: float, x: float) -> float:
     p = -0.14207133650779724 + s * (0.10654674470424652 + s * (-0.07533670216798782 + s * p))
     a = r + r * s * (-0.3333309292793274 + s * (0.19993053376674652 + s * p))
     if wp.abs(y) > wp.abs(x):
-        a = 0.5 * PI - a
+        a = 0.5 * wp.PI - a
     if x < 0.0:
-        a = PI - a
+        a = wp.PI - a
     if y < 0.0:
         a = -a
     return a
@@ -34,9 +32,9 @@ def arc_tangent(y: float, x: float) -> float:
 @wp.func
 def direction_to_uv(d: wp.vec3) -> wp.vec2:
     """Map a unit direction, world frame, to (u, v) in [0, 1)^2."""
-    u = 0.5 - arc_tangent(d[0], d[2]) * (0.5 / PI)
+    u = 0.5 - arc_tangent(d[0], d[2]) * (0.5 / wp.PI)
     # acos(y) loses all digits near the poles; atan2 of the horizontal part does not.
-    v = arc_tangent(wp.sqrt(d[0] * d[0] + d[2] * d[2]), d[1]) * (1.0 / PI)
+    v = arc_tangent(wp.sqrt(d[0] * d[0] + d[2] * d[2]), d[1]) * (1.0 / wp.PI)
     if u >= 1.0:
         u = u - 1.0
     return wp.vec2(u, v)
@@ -45,8 +43,8 @@ def direction_to_uv(d: wp.vec3) -> wp.vec2:
 @wp.func
 def uv_to_direction(u: float, v: float) -> wp.vec3:
     """Map (u, v) to a unit direction, world frame."""
-    lon = PI * (1.0 - 2.0 * u)
-    theta = PI * v
+    lon = wp.PI * (1.0 - 2.0 * u)
+    theta = wp.PI * v
     s = wp.sin(theta)
     return wp.vec3(wp.sin(lon) * s, wp.cos(theta), wp.cos(lon) * s)
 

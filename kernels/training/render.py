@@ -23,7 +23,6 @@ from warpir.kernels.training.scene import (
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979)
 SUBSETS = wp.constant(4)
 """Each point of a pixel asks every fourth direction; neighbouring points ask different ones."""
 
@@ -98,11 +97,11 @@ def render_scenes(
                     wp.vec2(wp.randf(state), wp.randf(state)),
                     wp.vec2((p[0] + p[2]) * spread, p[1] * spread),
                 )  # fmt: skip
-            radiance = wp.cw_mul(albedo, e) / PI
+            radiance = wp.cw_mul(albedo, e) / wp.PI
         elif shows_ground and ground.is_seen[scene] == 1:
             n = wp.vec3(0.0, 1.0, 0.0)
             e = irradiance_among_solids(light, solids, scene, first, SUBSETS, lifted, n, 1.0)
-            radiance = wp.cw_mul(ground_albedo(maps, ground, scene, ground_point), e) / PI
+            radiance = wp.cw_mul(ground_albedo(maps, ground, scene, ground_point), e) / wp.PI
             c = 1.0 + d[1]
             gloss = ground.wetness[scene] * (0.02 + 0.98 * c * c * c * c * c)
             radiance = radiance * (1.0 - gloss)

@@ -9,7 +9,6 @@ import warp as wp
 
 from warpir.kernels.maths.latlong import bilinear_tap, direction_to_uv
 
-PI = wp.constant(3.14159265358979)
 FAR = wp.constant(1.0e6)
 BOX = wp.constant(0)
 ELLIPSOID = wp.constant(1)
@@ -280,7 +279,7 @@ def seen_sky(
         return wp.cw_mul(map_at(maps.seen, panorama, m), lights.gain[scene])
     sigma = wp.max(lights.sun_sigma[scene], 0.005)
     away = (1.0 - wp.dot(d, lights.sun_axis[scene])) / (sigma * sigma)
-    disc = lights.sun[scene] * (wp.exp(-away) / (2.0 * PI * sigma * sigma))
+    disc = lights.sun[scene] * (wp.exp(-away) / (2.0 * wp.PI * sigma * sigma))
     return without_sun(maps, lights, scene, d) + disc
 
 

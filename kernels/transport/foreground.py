@@ -43,7 +43,6 @@ from warpir.kernels.types import (
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979)
 NARROW = wp.constant(4.0)
 """Specular lobes with ``alpha`` below this many texel sides are sampled by the BSDF too."""
 
@@ -121,7 +120,7 @@ def layers_of(points: SurfacePoints, material: MaterialArgs, p: int, s: int) -> 
 @wp.func
 def is_narrow(roughness: float, layers: Layers, height: int) -> int:
     """Return 1 when a specular lobe may be too narrow for one direction per texel."""
-    if roughness_to_alpha(narrowest_roughness(roughness, layers)) < NARROW * PI / float(height):
+    if roughness_to_alpha(narrowest_roughness(roughness, layers)) < NARROW * wp.PI / float(height):
         return 1
     return 0
 
@@ -153,7 +152,7 @@ def direct_row(
     i = t // texels.width
     j = t % texels.width
     directions = texels.direction_count[t]
-    below = -wp.sin(TENT_REACH * PI / float(texels.height))
+    below = -wp.sin(TENT_REACH * wp.PI / float(texels.height))
     key = hash_pair(pixel_key, wp.uint32(t))
     # Which of the pixel's points
     spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)

@@ -23,8 +23,6 @@ from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArg
 
 wp.set_module_options({"enable_backward": False})
 
-PI = wp.constant(3.14159265358979)
-
 
 @wp.kernel
 def trace_receiver_points(
@@ -162,7 +160,7 @@ def trace_blocked(
     shift = to_unit(hash_uint(key))
     start = position[p, 0]
     # A tent's direction that meets the box passes the centre's ray at less than this distance.
-    reach = TENT_REACH * PI / float(texels.height)
+    reach = TENT_REACH * wp.PI / float(texels.height)
     far = wp.length(wp.max(wp.abs(mesh.low - start), wp.abs(mesh.high - start))) + spread[p]
     margin = reach * far + spread[p]
     low = mesh.low - wp.vec3(margin, margin, margin)
@@ -259,7 +257,7 @@ def trace_received(
                 total += arriving
                 if arriving > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
                     kept += arriving * (1.0 - visibility(mesh, material, texture, origin, wi))
-        scale = texels.d_omega[i] / (PI * float(directions))
+        scale = texels.d_omega[i] / (wp.PI * float(directions))
         wp.atomic_add(received, p, t, total * scale)
         wp.atomic_add(blocked, p, t, kept * scale * share[p])
 
