@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from warpir.kernels.bsdf import INV_PI, smith_lambda, visible_normal_sample
+from warpir.kernels.dielectric.interface import fresnel_dielectric
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
 from warpir.kernels.maths.lanes import lane_sum
@@ -267,15 +268,6 @@ def object_ray(window: ObjectWindow, u: wp.vec2) -> ObjectRay:
 
 
 @wp.func
-def dielectric_fresnel(cos_i: float) -> float:
-    """Return the unpolarised reflectance of a coat of `GROUND_IOR` seen from air (Fresnel)."""
-    cos_t = wp.sqrt(1.0 - (1.0 - cos_i * cos_i) / (GROUND_IOR * GROUND_IOR))
-    across = (cos_i - GROUND_IOR * cos_t) / (cos_i + GROUND_IOR * cos_t)
-    along = (GROUND_IOR * cos_i - cos_t) / (GROUND_IOR * cos_i + cos_t)
-    return 0.5 * (across * across + along * along)
-
-
-@wp.func
 def mirrored_ray(normal: wp.vec3, wo: wp.vec3, alpha: float, u: wp.vec2) -> ObjectRay:
     """Draw a direction that a coat reflects toward ``wo``, by its visible GGX normals.
 
@@ -292,7 +284,9 @@ def mirrored_ray(normal: wp.vec3, wo: wp.vec3, alpha: float, u: wp.vec2) -> Obje
         wi = wm * (2.0 * cos_d) - o
         if wi[2] > 0.0:
             masked = 1.0 + smith_lambda(o, alpha)
-            out.weight = dielectric_fresnel(cos_d) * masked / (masked + smith_lambda(wi, alpha))
+            out.weight = (
+                fresnel_dielectric(cos_d, GROUND_IOR) * masked / (masked + smith_lambda(wi, alpha))
+            )
             out.direction = to_world(wi, frame)
     return out
 
