@@ -22,10 +22,9 @@ from warpir.kernels.tracing.hit import offset_origin
 from warpir.kernels.tracing.ray import camera_hit, camera_ray, visibility
 from warpir.kernels.tracing.surface import Surface, surface_at
 from warpir.kernels.transport.texels import (
-    GOLDEN_COLUMN,
-    GOLDEN_ROW,
     TENT_REACH,
     TexelArgs,
+    point_of,
     random_pair,
     tent_direction,
     texel_pdf,
@@ -154,10 +153,7 @@ def direct_row(
     directions = texels.direction_count[t]
     below = -wp.sin(TENT_REACH * wp.PI / float(texels.height))
     key = hash_pair(pixel_key, wp.uint32(t))
-    # Which of the pixel's points
-    spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
-    spot = spot - wp.floor(spot)
-    start = wp.min(int(spot * float(count)), count - 1)
+    start = point_of(i, j, shift, count)
     for r in range(first, wp.min(first + texels.item_size, directions)):
         s = (start + r) % count
         n = points.n[p, s]

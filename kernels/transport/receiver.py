@@ -12,10 +12,9 @@ from warpir.kernels.receiver_mesh import receiver_mesh_hit, receiver_radiance, r
 from warpir.kernels.sampling import cosine_sample
 from warpir.kernels.tracing.ray import closest_hit, meets_box, visibility
 from warpir.kernels.transport.texels import (
-    GOLDEN_COLUMN,
-    GOLDEN_ROW,
     TENT_REACH,
     TexelArgs,
+    point_of,
     random_pair,
     tent_direction,
 )
@@ -104,9 +103,7 @@ def blocked_share(
     j = t % texels.width
     key = hash_pair(pixel_key, wp.uint32(t))
     directions = texels.direction_count[t]
-    spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
-    spot = spot - wp.floor(spot)
-    start = wp.min(int(spot * float(filled)), filled - 1)
+    start = point_of(i, j, shift, filled)
     total = float(0.0)
     for r in range(first, wp.min(first + texels.item_size, directions)):
         ray_key = hash_pair(key, wp.uint32(r))
@@ -235,9 +232,7 @@ def trace_received(
         j = t % texels.width
         key = hash_pair(pixel_key, wp.uint32(t))
         directions = texels.direction_count[t]
-        spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
-        spot = spot - wp.floor(spot)
-        start = wp.min(int(spot * float(filled)), filled - 1)
+        start = point_of(i, j, shift, filled)
         first = texels.item_first[item]
         total = float(0.0)
         kept = float(0.0)

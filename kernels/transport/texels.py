@@ -54,6 +54,14 @@ def random_pair(key: wp.uint32, draw: int) -> wp.vec2:
 
 
 @wp.func
+def point_of(i: int, j: int, shift: float, count: int) -> int:
+    """Return with which of a pixel's ``count`` points the directions of texel (i, j) begin."""
+    spot = shift + GOLDEN_ROW * float(i) + GOLDEN_COLUMN * float(j)
+    spot = spot - wp.floor(spot)
+    return wp.min(int(spot * float(count)), count - 1)
+
+
+@wp.func
 def tent_uv(i: int, j: int, height: int, width: int, u: wp.vec2) -> wp.vec2:
     """Draw texture coordinates from the tent of texel (i, j), folded at the poles."""
     x = (float(j) + 0.5 + tent(u[0])) / float(width)
