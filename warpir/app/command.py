@@ -226,6 +226,19 @@ class _HelpAll(argparse.Action):
         parser.exit()
 
 
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads an argument as a whole number of a range."""
+
+    def read(text: str) -> int:
+        is_number = text.isascii() and text.isdigit() and len(text) < 20
+        if not (is_number and least <= int(text) <= most):
+            expected = f"expected a whole number from {least} to {most}"
+            raise argparse.ArgumentTypeError(f"{expected} (found {text[:40]})")
+        return int(text)
+
+    return read
+
+
 def _make_parser() -> argparse.ArgumentParser:
     parser = make_parser("insert", USAGE, DESCRIPTION, EXAMPLES, FLAGS)
     group = parser.add_argument_group("the run itself")

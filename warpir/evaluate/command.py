@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpir.app.command import Parser
+from warpir.app.command import Parser, whole_number
 from warpir.app.config import InsertConfig, usage
 from warpir.app.program import run_program, say
 from warpir.core.atomic import write_file
@@ -41,6 +41,7 @@ SHEET_ROWS = ("lds-regression", "lds-uniform", "regression", "predictions", "bri
 SAVED = ("tables.md", "contact_sheet.png")
 OF_CAMERA = ("camera", "panoramas", "scenes", "seed", "width", "calibrator", "json", "debug")
 """Flags that go with ``--camera``."""
+COUNT = whole_number(0, 2**32 - 1)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--predictions", type=Path, metavar="DIR", help="another system's maps of exported crops")
     add("--export-crops", type=Path, metavar="DIR", help="write the photographs for another system")
     words = "rendered photographs on which the regressor's direction is measured too"
-    add("--procedural", type=_count, default=0, metavar="N", help=words)
+    add("--procedural", type=COUNT, default=0, metavar="N", help=words)
     _add_model_flags(parser)
     words = "measure the estimated cameras instead of the light; nothing is rendered"
     add("--camera", action="store_true", help=words)
@@ -72,8 +73,8 @@ def _add_scene_flags(parser: argparse.ArgumentParser) -> None:
     words = "lat-long .hdr and .exr files, or folders of them"
     add("--panoramas", type=Path, nargs="+", metavar="PATH", help=words)
     add("--assets", type=Path, nargs="+", metavar="PATH", help="objects, or folders of them")
-    add("--scenes", type=_count, default=20, metavar="N", help="photographs (default: 20)")
-    add("--seed", type=_count, default=0, metavar="S", help="of everything that is random")
+    add("--scenes", type=COUNT, default=20, metavar="N", help="photographs (default: 20)")
+    add("--seed", type=COUNT, default=0, metavar="S", help="of everything that is random")
     add("--json", type=Path, metavar="FILE", help="all numbers")
     words = "JSON: kind of place by the panorama's name; adds a table by kind"
     add("--kinds", type=Path, metavar="FILE", help=words)
@@ -81,14 +82,14 @@ def _add_scene_flags(parser: argparse.ArgumentParser) -> None:
     add("--rows", metavar="A,B,...", help=words)
     add("--list-rows", action="store_true", help="print the rows and end")
     words = "of the photographs [px] (default: 384)"
-    add("--width", type=_count, default=384, metavar="W", help=words)
+    add("--width", type=COUNT, default=384, metavar="W", help=words)
     words = "vertical field of view (default: 60)"
     add("--fov", type=float, default=60.0, metavar="DEG", help=words)
     words = "the camera's response, which no row knows: gamma (default) or filmic"
     add("--curve", default="gamma", metavar="NAME", help=words)
-    add("--samples", type=_count, default=64, metavar="N", help="per pixel (default: 64)")
+    add("--samples", type=COUNT, default=64, metavar="N", help="per pixel (default: 64)")
     add("--device", metavar="NAME", help="cpu, cuda or cuda:N")
-    add("--threads", type=_count, default=0, metavar="N", help="on the CPU (default: one per core)")
+    add("--threads", type=COUNT, default=0, metavar="N", help="on the CPU (default: one per core)")
 
 
 def _add_model_flags(parser: argparse.ArgumentParser) -> None:
@@ -99,14 +100,7 @@ def _add_model_flags(parser: argparse.ArgumentParser) -> None:
     add("--regressor", type=Path, metavar="FILE", help=words)
     add("--model", metavar="DIR", help="a Stable Diffusion for the rows that guide")
     add("--prompt", metavar="TEXT", help="what all objects are (default: their files' names)")
-    add("--steps", type=_count, metavar="N", help="of the guided rows")
-
-
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) < 2**32):
-        expected = f"expected a whole number from 0 to {2**32 - 1}"
-        raise argparse.ArgumentTypeError(f"{expected} (found {text[:40]})")
-    return int(text)
+    add("--steps", type=COUNT, metavar="N", help="of the guided rows")
 
 
 def _run(arguments: list[str]) -> int:

@@ -13,10 +13,10 @@ import math
 import os
 import random
 import secrets
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from warpir.app.command import Parser
+from warpir.app.command import Parser, whole_number
 from warpir.app.config import usage
 from warpir.app.program import run_program, say
 from warpir.app.record import file_hash
@@ -76,7 +76,7 @@ def _add_make_arguments(command: argparse.ArgumentParser) -> None:
     add("pairs", type=Path, metavar="PAIRS", help="manifest (JSON), or a folder of scenes")
     add("--out", type=Path, required=True, metavar="STUDY", help="new folder")
     add("--method", metavar="NAME", help="of a folder: the method the others are compared with")
-    at_least_one, count = _whole_number(1, LARGEST), _whole_number(0, LARGEST)
+    at_least_one, count = whole_number(1, LARGEST), whole_number(0, LARGEST)
     add("--raters", type=at_least_one, default=9, metavar="N", help="people a pair (default: 9)")
     add("--runs", type=at_least_one, default=3, metavar="N", help="of the study (default: 3)")
     repeats = f"pairs shown twice to a rater (default: one in {PAIRS_PER_REPEAT})"
@@ -89,7 +89,7 @@ def _add_make_arguments(command: argparse.ArgumentParser) -> None:
     misses = "catch pairs that a rater may miss and still count (default: 0)"
     add("--catch-misses", type=count, default=0, metavar="N", help=misses)
     add("--pairs-per-rater", type=at_least_one, metavar="N", help="most pairs (default: all)")
-    number = _whole_number(0, 10**19 - 1)
+    number = whole_number(0, 10**19 - 1)
     add("--seed", type=number, metavar="N", help="of sides and order (default: a new random one)")
     add("--alpha", choices=("refuse", "ignore"), default="refuse", help="of transparent images")
     add("--max-pixels", type=number, default=LIMITS.pixels, metavar="N", help="largest image [px]")
@@ -105,19 +105,6 @@ def _add_score_arguments(command: argparse.ArgumentParser) -> None:
     add("--json", type=Path, metavar="FILE", help="all figures")
     add("--markdown", type=Path, metavar="FILE", help="the tables")
     add("--overwrite", action="store_true", help="replace --json and --markdown")
-
-
-def _whole_number(least: int, most: int) -> Callable[[str], int]:
-    """Return what reads an argument as a whole number of a range."""
-
-    def read(text: str) -> int:
-        is_number = text.isascii() and text.isdigit() and len(text) < 20
-        if not (is_number and least <= int(text) <= most):
-            expected = f"expected a whole number from {least} to {most}"
-            raise argparse.ArgumentTypeError(f"{expected} (found {text[:40]})")
-        return int(text)
-
-    return read
 
 
 # -------------------------------------------------------------------------------------- make
