@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from warpir.core.arrays import BoolArray, Float64Array, FloatArray
+from warpir.core.arrays import BoolArray, Float64Array, FloatArray, mask_box
 from warpir.core.color import gamma_to_linear
 
 SHADOW_RATIO = 0.95
@@ -33,16 +33,11 @@ def make_regions(mask: FloatArray, ratio: FloatArray) -> dict[str, BoolArray]:
         ratio: True shadow ratio [1], shape [H, W, 3].
     """
     asset = mask > 0.0
-    height, width = asset.shape
-    box = np.zeros_like(asset)
-    if asset.any():
-        rows, columns = np.flatnonzero(asset.any(axis=1)), np.flatnonzero(asset.any(axis=0))
-        edges = []
-        for hit, size in ((rows, height), (columns, width)):
-            first, last = int(hit[0]), int(hit[-1]) + 1
-            grow = round(0.5 * BOX_GROWTH * (last - first))
-            edges.append(slice(max(first - grow, 0), min(last + grow, size)))
-        box[edges[0], edges[1]] = True
+    box, edges = np.zeros_like(asset), []
+    for side in mask_box(asset):
+        grow = round(0.5 * BOX_GROWTH * (side.stop - side.start))
+        edges.append(slice(max(side.start - grow, 0), side.stop + grow))
+    box[tuple(edges)] = True
     shadow = (ratio.mean(axis=-1) < SHADOW_RATIO) & (mask == 0.0)
     return {"full": np.ones_like(asset), "box": box, "asset": asset, "shadow": shadow}
 

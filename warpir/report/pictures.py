@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, WebPImagePlugin
 
-from warpir.core.arrays import BoolArray, CodeArray, FloatArray, on_cores
+from warpir.core.arrays import BoolArray, CodeArray, FloatArray, mask_box, on_cores
 from warpir.core.color import codes_of, linear_to_gamma, luminance
 from warpir.io.images.decoder import decode_image
 from warpir.io.layers import Layers
@@ -143,17 +143,14 @@ def object_box(layers: Layers) -> Box | None:
 
 
 def _box_of(chosen: BoolArray) -> Box | None:
-    rows, columns = np.flatnonzero(chosen.any(axis=1)), np.flatnonzero(chosen.any(axis=0))
-    if not len(rows):
+    rows, columns = mask_box(chosen)
+    if not rows.stop:
         return None
     height, width = chosen.shape
-    room = max(8, round(MARGIN * max(rows[-1] - rows[0], columns[-1] - columns[0])))
-    return (
-        max(int(columns[0]) - room, 0),
-        max(int(rows[0]) - room, 0),
-        min(int(columns[-1]) + 1 + room, width),
-        min(int(rows[-1]) + 1 + room, height),
-    )
+    longest = max(rows.stop - rows.start, columns.stop - columns.start) - 1
+    room = max(8, round(MARGIN * longest))
+    rows, columns = mask_box(chosen, room)
+    return columns.start, rows.start, min(columns.stop, width), min(rows.stop, height)
 
 
 def _cropped(layers: Layers, box: Box) -> Layers:
