@@ -17,6 +17,7 @@ from typing import Any
 
 from warpir.app.command import FLAGS, FORMS, SEPARATORS
 from warpir.app.config import DEFAULTS, flag
+from warpir.app.photo_world import WORDS
 from warpir.app.record import PATHS, config_of_picture, is_hub_id, name_of
 from warpir.app.settings import LightConfig
 
@@ -36,12 +37,6 @@ class Setting:
     """Whether the prior's default was used for an open value."""
 
 
-CAMERA_WORDS = {
-    "pitch_deg": "pitch",
-    "roll_deg": "roll",
-    "vfov_deg": "vertical field of view",
-}
-"""What the report calls the numbers of the camera."""
 ABOUT_FILES = (
     ("composite.png", "The result, at the photo's own resolution, depth and profile"),
     ("layers.exr", "The composite and its layers, linear, for Nuke, Natron, Fusion, Blender"),
@@ -338,7 +333,7 @@ def camera_sources(record: Mapping[str, Any]) -> Rows:
     """
     numbers = record["measured"].get("camera", {})
     rows: Rows = []
-    for name, what in CAMERA_WORDS.items():
+    for name, what in WORDS.items():
         if number := numbers.get(name):
             sigma = "" if number["sigma"] is None else f" ± {number['sigma']:.1f}"
             rows.append((what, f"{number['value']:.1f}{sigma}° ({number['source']})"))
