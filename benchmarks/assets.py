@@ -15,9 +15,8 @@ from typing import Any
 
 from benchmarks.measure import table
 from warpir.core.errors import InputError
+from warpir.evaluate.scenes import ASSET_SUFFIXES
 from warpir.io.assets import load_asset
-
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 
 def measure(path: Path, repeats: int) -> dict[str, Any]:
@@ -45,7 +44,7 @@ def loads(folder: Path, repeats: int) -> dict[str, Any]:
     found = {
         path.relative_to(folder).as_posix(): measure(path, repeats)
         for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in SUFFIXES
+        if path.suffix.lower() in ASSET_SUFFIXES
     }
     columns = ("seconds", "triangles", "primitives", "textures", "megapixels", "notices")
     rows = []
