@@ -48,7 +48,7 @@ from warpir.place.stance import Stance, ground_to_world, stance_of
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
 from warpir.scene.near.lamps import Lamp
-from warpir.scene.placement import place_asset, upright_plane
+from warpir.scene.placement import foot_of_box, place_asset, upright_plane
 
 CAMERA, CONFIG, MASK = "camera.json", "insert.json", "occluder.png"
 """Names of the files."""
@@ -166,11 +166,10 @@ def _in_view(
     x, _, z = (float(c) for c in (ahead @ (0.0, 0.0, -away, 1.0))[:3])
     place = frame @ (x, 0.0, z, 1.0)
     low, high = asset.bounds()
-    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0])
     scale = min(1.0, LARGEST_START * np.hypot(away, stance.height) / float((high - low).max()))
     pose = frame @ Stance(0.0, 0.0, 0.0, rotate_y, 0.0, 0.0).c2w()
     pose[:3, :3] *= scale
-    pose[:3, 3] = place[:3] - pose[:3, :3] @ foot
+    pose[:3, 3] = place[:3] - pose[:3, :3] @ foot_of_box(low, high)
     return pose
 
 
@@ -182,7 +181,7 @@ def start_record(session: Session, light: LightConfig, folder: str) -> dict[str,
     camera, asset = session.camera, session.asset
     low, high = asset.bounds()
     to_ground = np.linalg.inv(session.frame)
-    foot = np.array([(low[0] + high[0]) / 2.0, low[1], (low[2] + high[2]) / 2.0, 1.0])
+    foot = np.append(foot_of_box(low, high), 1.0)
     x, _, z, _ = (float(c) for c in to_ground @ session.asset_to_world @ foot)
     scale = float(np.linalg.norm(session.asset_to_world[:3, 0]))
     sky_radiance = {name: sky for name, (sky, _) in SKIES.items()}

@@ -124,7 +124,8 @@ def place_asset(
         warnings += steep
     scale = _scale_of(high - low, scale, size, assumed, warnings)
     rotation = turn(plane[:3], math.radians(rotate_y)) @ y_to(plane[:3])
-    asset_to_world = _standing(low, high, scale, rotation, stand)
+    moved = stand - scale * (rotation @ foot_of_box(low, high))
+    asset_to_world = affine_matrix(scale * rotation, moved)
     shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
     where = "--at" if place is None else "--place"
     standing = where, box_corners(low, high), asset_to_world, camera
@@ -210,13 +211,6 @@ def gap_below(
     reach = first_hit(below, top, np.tile((0.0, -1.0, 0.0), (len(top), 1)))[0]
     floor = np.maximum(top[:, 1] - reach, level if is_plane else -math.inf)
     return float((lowest[:, 1] - floor).min())
-
-
-def _standing(
-    low: Float64Array, high: Float64Array, scale: float, rotation: Float64Array, stand: Float64Array
-) -> Float64Array:
-    """Return the matrix that puts the centre of a bounding box's lowest face at a point."""
-    return affine_matrix(scale * rotation, stand - scale * (rotation @ foot_of_box(low, high)))
 
 
 def foot_of_box(low: Float64Array, high: Float64Array) -> Float64Array:
