@@ -170,11 +170,10 @@ class _Handler(BaseHTTPRequestHandler):
         if name is None:
             return
         length = self.headers.get("Content-Length", "")
+        is_number = length.isascii() and length.isdigit() and len(length) < 10
         if name not in self.server.answers:
             self._refuse(404)
-        elif not (length.isascii() and length.isdigit() and len(length) < 10):
-            self._refuse(413)
-        elif int(length) > LARGEST_REQUEST:
+        elif not (is_number and int(length) <= LARGEST_REQUEST):
             self._refuse(413)
         else:
             body = self.rfile.read(int(length))
