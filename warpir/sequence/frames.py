@@ -13,6 +13,7 @@ same files, are left as they are, so an interrupted sequence goes on where it st
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from warpir.core.strict_json import (
     read_json_object,
 )
 from warpir.lighting.scene_light import make_light
-from warpir.sequence.video import VIDEO, NoVideo, find_ffmpeg, write_video
+from warpir.sequence.video import VIDEO, NoVideo, write_video
 
 FORMAT = "warpir-sequence"
 VERSION = 1
@@ -204,7 +205,7 @@ def is_whole(config: InsertConfig, frames: Sequence[Frame]) -> bool:
         return False
     before, digest = _made_before(config), _video_digest(config)
     if not before:
-        return find_ffmpeg() is None
+        return shutil.which("ffmpeg") is None
     return before == _video_record(config, frames, digest)
 
 

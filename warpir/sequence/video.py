@@ -40,11 +40,6 @@ class NoVideo(Exception):
     """There is none; the text says why, for a notice."""
 
 
-def find_ffmpeg() -> str | None:
-    """Return the program that makes videos, where there is one."""
-    return shutil.which("ffmpeg")
-
-
 def write_video(
     path: Path, frames: Sequence[Path], fps: float, max_pixels: int = LIMITS.pixels
 ) -> None:
@@ -62,7 +57,7 @@ def write_video(
     Raises:
         NoVideo: No ffmpeg, sizes that differ, or ffmpeg or the disk refused it.
     """
-    program = find_ffmpeg()
+    program = shutil.which("ffmpeg")
     if program is None:
         raise NoVideo("no ffmpeg was found on PATH, so there is no video of the frames")
 
