@@ -101,9 +101,6 @@ class Positive(torch.nn.Module):
         """Return the values."""
         return torch.nn.functional.softplus(self.raw)
 
-    def project(self) -> None:
-        """Do nothing: the values have no upper bound."""
-
 
 class Factors(torch.nn.Module):
     """Factors of an asset's materials, some of them free.
@@ -141,10 +138,10 @@ class Factors(torch.nn.Module):
         )
 
     def project(self) -> None:
-        """Bring all factors back within their bounds."""
+        """Bring the bounded factors back within their bounds."""
         for values in self.parts.values():
-            assert isinstance(values, Between | Positive)
-            values.project()
+            if isinstance(values, Between):
+                values.project()
 
     def materials(self) -> tuple[Material, ...]:
         """Return the asset's materials with the factors as they are."""
