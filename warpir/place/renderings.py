@@ -155,10 +155,6 @@ class Renderings:
         if is_lost and self._placement is not None:
             self.warm_up(self._placement)
 
-    def _say(self, line: str, share: float | None) -> None:
-        with self._lock:
-            self._progress.update(line=line, share=share)
-
     def _hear(self, said: Mapping[str, Any]) -> None:
         """Tell a preview's progress, and that of what it waits for."""
         with self._lock:
@@ -214,7 +210,8 @@ class Renderings:
         for line in process.stdout:
             if line.startswith("error: ") or not last.startswith("error: "):
                 last = line.strip()
-            self._say(last, None)
+            with self._lock:
+                self._progress.update(line=last, share=None)
         if process.wait() != 0:
             raise InputError("warpir.insert", last.removeprefix("error: "))
         self._results = results

@@ -126,7 +126,7 @@ class MaterialReader:
     def _read(self, entry: Entry) -> Material:
         name = entry.text("name", "") or entry.pointer
         pbr = entry.child("pbrMetallicRoughness")
-        *base, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4, 0.0, 1.0)
+        *base, alpha = self._factors(pbr, "baseColorFactor", (1.0,) * 4)
         mode = entry.text("alphaMode", "OPAQUE")
         if mode not in ("OPAQUE", "MASK", "BLEND"):
             expected = "OPAQUE, MASK or BLEND"
@@ -196,7 +196,7 @@ class MaterialReader:
 
         The dielectric's reflectance is the specular colour itself, at an infinite index.
         """
-        *diffuse, alpha = self._factors(entry, "diffuseFactor", (1.0,) * 4, 0.0, 1.0)
+        *diffuse, alpha = self._factors(entry, "diffuseFactor", (1.0,) * 4)
         specular = self._color(entry, "specularFactor", 1.0)
         glossiness = self._factor(entry, "glossinessFactor", 1.0)
         slot = self._slot(entry, "specularGlossinessTexture")
@@ -378,17 +378,17 @@ class MaterialReader:
         return min(max(value, low), high)
 
     def _factors(
-        self, entry: Entry, key: str, default: tuple[float, ...], low: float, high: float
+        self, entry: Entry, key: str, default: tuple[float, ...], high: float = 1.0
     ) -> tuple[float, ...]:
         values = entry.numbers(key, default)
-        if any(not low <= value <= high for value in values):
-            self.notices.append(f"{entry.pointer}: {key} clamped to {low:g} ... {high:g}")
-        return tuple(min(max(value, low), high) for value in values)
+        if any(not 0.0 <= value <= high for value in values):
+            self.notices.append(f"{entry.pointer}: {key} clamped to 0 ... {high:g}")
+        return tuple(min(max(value, 0.0), high) for value in values)
 
     def _color(
         self, entry: Entry, key: str, default: float, high: float = 1.0
     ) -> tuple[float, float, float]:
-        red, green, blue = self._factors(entry, key, (default,) * 3, 0.0, high)
+        red, green, blue = self._factors(entry, key, (default,) * 3, high)
         return red, green, blue
 
     def _slot(self, owner: Entry, key: str) -> TextureSlot | None:
