@@ -25,7 +25,6 @@ from warpir.kernels.transport.texels import (
     TENT_REACH,
     TexelArgs,
     point_of,
-    random_pair,
     tent_direction,
     texel_pdf,
 )
@@ -159,11 +158,7 @@ def direct_row(
         n = points.n[p, s]
         # Half of the texels are behind the surface: say so before a direction is drawn.
         if wp.dot(texels.centre[t], n) > below:
-            u = random_pair(key, -1)
-            if directions > 1:
-                u = sobol_pair(r, key, 0)
-            ray_key = hash_pair(key, wp.uint32(r))
-            wi = tent_direction(texels, i, j, u, ray_key, 0, n)
+            wi = tent_direction(texels, i, j, r, key, 0, n)
             ng = points.ng[p, s]
             if wp.dot(wi, n) > 0.0 and wp.dot(wi, ng) > 0.0:
                 frame = basis(n)

@@ -15,7 +15,6 @@ from warpir.kernels.transport.texels import (
     TENT_REACH,
     TexelArgs,
     point_of,
-    random_pair,
     tent_direction,
 )
 from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArgs, TextureArgs
@@ -106,11 +105,7 @@ def blocked_share(
     start = point_of(i, j, shift, filled)
     total = float(0.0)
     for r in range(first, wp.min(first + texels.item_size, directions)):
-        ray_key = hash_pair(key, wp.uint32(r))
-        u = random_pair(key, -1)
-        if directions > 1:
-            u = sobol_pair(r, key, 0)
-        wi = tent_direction(texels, i, j, u, ray_key, 1, receiver.normal)
+        wi = tent_direction(texels, i, j, r, key, 1, receiver.normal)
         origin = position[p, (start + r) % filled] + receiver.normal * mesh.epsilon
         if wp.dot(wi, receiver.normal) > 0.0 and meets_box(origin, wi, mesh.low, mesh.high) == 1:
             total += 1.0 - visibility(mesh, material, texture, origin, wi)
@@ -241,10 +236,7 @@ def trace_received(
             point = ReceiverPoint()
             point.position = position[p, s]
             point.normal = normal[p, s]
-            u = random_pair(key, -1)
-            if directions > 1:
-                u = sobol_pair(r, key, 0)
-            wi = tent_direction(texels, i, j, u, hash_pair(key, wp.uint32(r)), 0, point.normal)
+            wi = tent_direction(texels, i, j, r, key, 0, point.normal)
             cos_i = wp.dot(wi, point.normal)
             if cos_i > 0.0:
                 origin = receiver_origin(mesh, receiver, point)

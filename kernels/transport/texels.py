@@ -8,7 +8,7 @@ texels around it, a direction would let a sun in one texel flicker by its interp
 import warp as wp
 
 from warpir.kernels.maths.latlong import BilinearTap, uv_to_direction
-from warpir.kernels.maths.rng import hash_pair, hash_uint, to_unit
+from warpir.kernels.maths.rng import hash_pair, hash_uint, sobol_pair, to_unit
 from warpir.kernels.sampling import tent
 
 TRIES_MAX = wp.constant(32)
@@ -77,23 +77,29 @@ def tent_uv(i: int, j: int, height: int, width: int, u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def tent_direction(
-    texels: TexelArgs, i: int, j: int, u: wp.vec2, key: wp.uint32, weigh: int, normal: wp.vec3
+    texels: TexelArgs, i: int, j: int, r: int, key: wp.uint32, weigh: int, normal: wp.vec3
 ) -> wp.vec3:
-    """Draw a direction from texel (i, j)'s tent, evenly in solid angle.
+    """Draw direction ``r`` from texel (i, j)'s tent, evenly in solid angle; ``key`` is the texel's.
 
     The density is ``weight / d_omega`` [1/sr]; with ``weigh`` 1 it also follows the cosine with
-    ``normal``. ``u`` makes the first try, so its stratification survives where that is accepted.
+    ``normal``. The first tries of several directions are stratified, which survives where they are
+    accepted.
     """
-    bound = texels.bound[i * texels.width + j]
+    t = i * texels.width + j
+    bound = texels.bound[t]
+    u = random_pair(key, -1)
+    if texels.direction_count[t] > 1:
+        u = sobol_pair(r, key, 0)
+    ray_key = hash_pair(key, wp.uint32(r))
     uv = tent_uv(i, j, texels.height, texels.width, u)
     wi = uv_to_direction(uv[0], uv[1])
     for draw in range(TRIES_MAX):
         share = wp.sqrt(wi[0] * wi[0] + wi[2] * wi[2])
         if weigh == 1:
             share = share * wp.dot(wi, normal)
-        if random_pair(key, 2 * draw)[0] * bound <= share:
+        if random_pair(ray_key, 2 * draw)[0] * bound <= share:
             break
-        uv = tent_uv(i, j, texels.height, texels.width, random_pair(key, 2 * draw + 1))
+        uv = tent_uv(i, j, texels.height, texels.width, random_pair(ray_key, 2 * draw + 1))
         wi = uv_to_direction(uv[0], uv[1])
     return wi
 
