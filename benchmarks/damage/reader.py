@@ -117,7 +117,7 @@ def _config(path: Path) -> None:
 
 
 def _run(path: Path) -> None:
-    from warpir.app.reuse import read_run
+    from warpir.app.earlier_runs import read_run
 
     run = read_run(path.parent)
     _finite(run.c2w, run.light_fg.texels, run.light_shadow.texels)

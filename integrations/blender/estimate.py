@@ -41,7 +41,7 @@ def write_grain(result: Path, path: Path) -> None:
     import numpy as np
     from PIL import Image
 
-    from warpir.app.finished import config_of_record
+    from warpir.app.earlier_runs import config_of_record
     from warpir.app.inputs import read_photo_of
     from warpir.core.color import GAMMA
     from warpir.io.images.writers import exr_bytes

@@ -26,8 +26,8 @@ from tests.builders.insertions import (
 from tests.builders.refusals import assert_fails
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
+from warpir.app.earlier_runs import read_run
 from warpir.app.inputs import read_inputs
-from warpir.app.reuse import read_run
 from warpir.core.errors import ExitCode, InputError
 from warpir.core.latlong import rotate_map
 from warpir.io.curves_file import curves_to_json, read_curves

@@ -16,7 +16,7 @@ from tests.builders.programs.stops import stop_run
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
-from warpir.app.finished import OtherRun, is_done
+from warpir.app.earlier_runs import OtherRun, is_done
 from warpir.core.errors import ExitCode
 from warpir.core.limits import Limits
 from warpir.diffusion.prompts import make_prompts

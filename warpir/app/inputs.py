@@ -19,6 +19,7 @@ from warpir.app.config import (
     unread_by_loss,
     usage,
 )
+from warpir.app.earlier_runs import EarlierRun, read_run
 from warpir.app.model_files import require_model
 from warpir.app.photo_world import (
     CameraEstimator,
@@ -28,7 +29,6 @@ from warpir.app.photo_world import (
     photo_camera,
 )
 from warpir.app.record import PATHS, file_hash, input_files
-from warpir.app.reuse import EarlierRun, read_run
 from warpir.app.settings import InputConfig, LightConfig
 from warpir.app.standing import stand_on_ground
 from warpir.core.arrays import Float64Array, FloatArray
@@ -145,8 +145,7 @@ def read_inputs(config: InsertConfig, loaders: Loaders | None = None) -> Inputs:
     try:
         return _joined(config, files, loaders)
     except InputError as error:
-        other = other_camera(files.view.camera)
-        if other is None:
+        if (other := other_camera(files.view.camera)) is None:
             raise
         changed, notice = other
         try:

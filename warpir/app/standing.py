@@ -114,15 +114,8 @@ def _set_free(
     eye = world.camera.c2w[:3, 3]
     plane = upright_plane(world.ground, eye)
     ground = _open_ground(world, plane)
-    if world.cloud is None:
-        try:
-            usual = put(None)
-        except InputError:
-            pass  # above the horizon, or outside the photo: the search below tells
-        else:
-            there = Stand(usual.asset_to_world, low, high, world.camera)
-            if there.is_well_seen and (ground is None or ground.holds(there)):
-                return usual
+    if world.cloud is None and _is_usual(stand, ground):
+        return put(None)
     own, keeps_size = float((high - low).max()), is_sized
     lines = []
     try:
@@ -156,6 +149,15 @@ def _set_free(
             why += ", on what looks like open ground"
     lines.append(f"the object stands at {shown}, {why} (--at, --place)")
     return replace(placement, assumed=(*placement.assumed, *lines))
+
+
+def _is_usual(stand: Callable[[None], Stand], ground: OpenGround | None) -> bool:
+    """Return whether an object is well seen, and on open ground, at the usual pixel."""
+    try:
+        there = stand(None)
+    except InputError:
+        return False  # above the horizon, or outside the photo: the search for a place tells
+    return there.is_well_seen and (ground is None or ground.holds(there))
 
 
 def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from warpir.app.config import InsertConfig
-from warpir.app.finished import OtherRun, config_of_record, is_done
+from warpir.app.earlier_runs import OtherRun, config_of_record, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.program import explain, extras_of, require_packages, say, stay_offline
 from warpir.app.run import memory_needs, needed_bytes, require_space

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpir.app.config import usage
+from warpir.app.earlier_runs import EarlierRun
 from warpir.app.inputs import Inputs
-from warpir.app.reuse import EarlierRun
 from warpir.app.settings import LightConfig
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import luminance

@@ -13,8 +13,8 @@ from typing import Any
 
 from warpir.app.command import Parser, read_values
 from warpir.app.config import DEFAULTS, InsertConfig, flag
+from warpir.app.earlier_runs import check_files, run_record
 from warpir.app.program import run_program, say
-from warpir.app.reuse import check_files, run_record
 from warpir.core.arrays import FloatArray
 from warpir.core.atomic import write_file
 from warpir.core.errors import ExitCode, InputError

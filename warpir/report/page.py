@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warpir.app.config import DEFAULTS, InsertConfig
-from warpir.app.finished import config_of_record
+from warpir.app.earlier_runs import config_of_record
 from warpir.app.record import name_of
 from warpir.core.arrays import CodeArray, FloatArray, on_cores
 from warpir.core.limits import LIMITS

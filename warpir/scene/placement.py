@@ -101,8 +101,7 @@ def place_asset(
         scale: Factor on the asset's own size [1].
         size: Longest side of the bounding box after scaling [m].
         mesh: Receiver mesh that the object may stand on.
-        is_plane: Whether it may stand on the ground plane too; without, ``place`` is not moved and
-            the plane only defines the upright direction.
+        is_plane: Whether it may stand on the plane too; else that tells up, and ``place`` stays.
         must_be_seen: Whether an object outside the photo is refused.
 
     Raises:
@@ -127,12 +126,12 @@ def place_asset(
     moved = stand - scale * (rotation @ foot_of_box(low, high))
     asset_to_world = affine_matrix(scale * rotation, moved)
     shown = " x ".join(f"{scale * side:.3g}" for side in high - low)
-    where = "--at" if place is None else "--place"
-    standing = where, box_corners(low, high), asset_to_world, camera
+    where, corners = "--at" if place is None else "--place", box_corners(low, high)
+    standing = where, corners, asset_to_world, camera
     _refuse_within(shown, *standing)
     is_seen, seen, cut = _in_view(*standing, must_be_seen)
-    away = f"{np.linalg.norm(stand - origin):.3g} m from the camera"
-    summary = f"the object of {shown} m stands {away}, {seen}"
+    away = float(np.linalg.norm(stand - origin))
+    summary = f"the object of {shown} m stands {away:.3g} m from the camera, {seen}"
     return Placement(asset_to_world, plane, tuple(assumed), tuple(warnings + cut), summary, is_seen)
 
 

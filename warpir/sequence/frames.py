@@ -23,7 +23,7 @@ import warpir
 from warpir.app.command import read_values
 from warpir.app.config import DEFAULTS, InsertConfig, as_usage, replaced_by, usage
 from warpir.app.config_file import by_name
-from warpir.app.finished import OtherRun, is_done
+from warpir.app.earlier_runs import OtherRun, is_done
 from warpir.app.inputs import Inputs, Loaders, read_inputs
 from warpir.app.record import file_hash
 from warpir.core.atomic import write_file
