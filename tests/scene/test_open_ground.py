@@ -8,7 +8,7 @@ import trimesh
 from PIL import Image, ImageDraw
 
 from warpir.app.config import InsertConfig
-from warpir.app.inputs import read_inputs
+from warpir.app.inputs import Loaders, read_inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.free_space import OpenGround, Stand, find_place
@@ -90,3 +90,16 @@ def test_inputs_say_why_an_object_was_moved(tmp_path: Path, asked: dict[str, obj
     there = Stand(inputs.placement.asset_to_world, *inputs.asset.bounds(), inputs.camera)
     is_moved = any("looks like open ground (--at" in line for line in inputs.assumed)
     assert is_moved == (not asked) == (inside(there.foot(), SOFA[0]) < 0.2)
+
+
+def test_an_object_stays_where_something_passes_in_a_later_frame(tmp_path: Path) -> None:
+    """Under a camera that stands still it must not jump: the first frame's look holds for all."""
+    trimesh.creation.box(extents=(0.8, 0.5, 0.8)).export(tmp_path / "box.glb")
+    loaders, places = Loaders(must_be_seen=False), []
+    for name, shown in (("1.png", photo()), ("2.png", photo(SOFA))):
+        Image.fromarray(np.round(255.0 * shown).astype(np.uint8)).save(tmp_path / name)
+        files = {"photo": name, "asset": "box.glb", "out": "out"}
+        paths = {key: str(tmp_path / path) for key, path in files.items()}
+        config = InsertConfig(**paths, pitch=-10.0, fov=71.0, roll=0.0, sky="clear")
+        places.append(read_inputs(config, loaders).placement.asset_to_world)
+    np.testing.assert_array_equal(places[0], places[1])

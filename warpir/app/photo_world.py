@@ -76,8 +76,8 @@ class PhotoWorld:
     """What was turned, one line each."""
     measured: dict[str, Any] = field(default_factory=dict)
     """What ``run.json`` says of the fit."""
-    photo: Photo | None = None
-    """As the camera sees it; without it nothing is known of how the ground looks."""
+    look: Callable[[], FloatArray] | None = None
+    """Shows the ground (`warpir.app.standing.small_look`); without it its look does not count."""
 
 
 def photo_camera(

@@ -8,8 +8,9 @@ import numpy as np
 
 from warpir.app.photo_world import PhotoWorld
 from warpir.app.settings import PlacementConfig
-from warpir.core.arrays import Float64Array
+from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError
+from warpir.io.images.photos import Photo
 from warpir.io.images.resize import resize
 from warpir.scene.asset import Asset
 from warpir.scene.camera import Camera
@@ -29,6 +30,31 @@ SEEN = 0.04
 its own where it is whole: smaller ones are hardly seen."""
 SHOWN = 0.25
 """The same where it does not."""
+
+
+def small_look(photo: Photo) -> FloatArray:
+    """Return a photo made small, in which `OpenGround` looks for open ground."""
+    shown = photo.exposed()[0]
+    share = min(1.0, LOOKED_AT / max(shown.shape[:2]))
+    height, width = (BLOCK * max(1, round(share * side / BLOCK)) for side in shown.shape[:2])
+    return resize(shown, height, width)
+
+
+class FirstLook:
+    """Shows for all photos of a sequence that have one size how the first one's ground looks.
+
+    Who walks by in a later one would let the object jump.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[int, ...], FloatArray] = {}
+
+    def __call__(self, photo: Photo) -> FloatArray:
+        """Return `small_look` of the first such photo."""
+        size = photo.codes.shape[:2]
+        if size not in self._found:
+            self._found[size] = small_look(photo)
+        return self._found[size]
 
 
 def stand_on_ground(
@@ -162,12 +188,9 @@ def _is_usual(stand: Callable[[None], Stand], ground: OpenGround | None) -> bool
 
 def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:
     """Return how the ground looks, where no points tell what stands there."""
-    if world.photo is None or world.cloud is not None:
+    if world.look is None or world.cloud is not None:
         return None
-    shown = world.photo.exposed()[0]
-    share = min(1.0, LOOKED_AT / max(shown.shape[:2]))
-    height, width = (BLOCK * max(1, round(share * side / BLOCK)) for side in shown.shape[:2])
-    return OpenGround.of(resize(shown, height, width), world.camera, plane)
+    return OpenGround.of(world.look(), world.camera, plane)
 
 
 def _usual_distance(camera: Camera, plane: Float64Array) -> float:
