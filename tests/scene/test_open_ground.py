@@ -103,3 +103,14 @@ def test_an_object_stays_where_something_passes_in_a_later_frame(tmp_path: Path)
         config = InsertConfig(**paths, pitch=-10.0, fov=71.0, roll=0.0, sky="clear")
         places.append(read_inputs(config, loaders).placement.asset_to_world)
     np.testing.assert_array_equal(places[0], places[1])
+
+
+def test_an_object_stays_where_no_open_ground_is_near(tmp_path: Path) -> None:
+    """Everywhere it would stand on narrow stripes of another colour."""
+    stripes = photo(*(((x, 120, x + 28, HEIGHT), (200, 60, 30)) for x in range(0, WIDTH, 80)))
+    Image.fromarray(np.round(255.0 * stripes).astype(np.uint8)).save(tmp_path / "photo.png")
+    trimesh.creation.box(extents=(1.2, 0.5, 1.2)).export(tmp_path / "box.glb")
+    files = {"photo": "photo.png", "asset": "box.glb", "out": "out"}
+    paths = {name: str(tmp_path / path) for name, path in files.items()}
+    inputs = read_inputs(InsertConfig(**paths, pitch=-10.0, fov=71.0, roll=0.0, sky="clear"))
+    assert any(f"at pixel {0.5 * WIDTH:g},{0.75 * HEIGHT:g}" in line for line in inputs.assumed)

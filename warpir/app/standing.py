@@ -140,7 +140,8 @@ def _set_free(
     eye = world.camera.c2w[:3, 3]
     plane = upright_plane(world.ground, eye)
     ground = _open_ground(world, plane)
-    if world.cloud is None and _is_usual(stand, ground):
+    usual = _usual(stand) if world.cloud is None else None
+    if usual is not None and (ground is None or ground.holds(usual)):
         return put(None)
     own, keeps_size = float((high - low).max()), is_sized
     lines = []
@@ -152,6 +153,8 @@ def _set_free(
         # So large that the camera is inside wherever it stands: begin with what lies ahead.
         away = 2.0 * float(plane[:3] @ eye + plane[3])
     else:
+        if usual is not None and ground is not None and not ground.holds(stand(place)):
+            return put(None)  # nothing is gained there
         placement = put(place)
         away = float(np.linalg.norm(np.subtract(place, eye)))
         keeps_size |= not stand(place).is_cut and stand(place).share_of_height >= SEEN
@@ -167,23 +170,27 @@ def _set_free(
             f"it would be {'hardly seen' if own < size else 'cut'} (--size, --scale)"
         )
     shown = ",".join(f"{round(x, 3) + 0.0:.3g}" for x in place)
-    why = "where no points are in its way"
-    if world.cloud is None:
-        there = Stand(placement.asset_to_world, low, high, world.camera)
-        why = "since the frame cuts it everywhere" if there.is_cut else "where it is seen whole"
-        if ground is not None and ground.holds(there):
-            why += ", on what looks like open ground"
-    lines.append(f"the object stands at {shown}, {why} (--at, --place)")
+    there = Stand(placement.asset_to_world, low, high, world.camera)
+    lines.append(f"the object stands at {shown}, {_reason(world, there, ground)} (--at, --place)")
     return replace(placement, assumed=(*placement.assumed, *lines))
 
 
-def _is_usual(stand: Callable[[None], Stand], ground: OpenGround | None) -> bool:
-    """Return whether an object is well seen, and on open ground, at the usual pixel."""
+def _usual(stand: Callable[[None], Stand]) -> Stand | None:
+    """Return how an object stands at the usual pixel; None where it is not well seen there."""
     try:
         there = stand(None)
     except InputError:
-        return False  # above the horizon, or outside the photo: the search for a place tells
-    return there.is_well_seen and (ground is None or ground.holds(there))
+        return None  # above the horizon, or outside the photo: the search for a place tells
+    return there if there.is_well_seen else None
+
+
+def _reason(world: PhotoWorld, there: Stand, ground: OpenGround | None) -> str:
+    """Return why an object that was not placed stands there."""
+    if world.cloud is not None:
+        return "where no points are in its way"
+    why = "since the frame cuts it everywhere" if there.is_cut else "where it is seen whole"
+    is_open = ground is not None and ground.holds(there)
+    return f"{why}, on what looks like open ground" if is_open else why
 
 
 def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:
