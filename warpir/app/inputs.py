@@ -30,7 +30,7 @@ from warpir.app.photo_world import (
 )
 from warpir.app.record import PATHS, file_hash, input_files
 from warpir.app.settings import InputConfig, LightConfig
-from warpir.app.standing import FirstLook, stand_on_ground
+from warpir.app.standing import FirstThumbnail, stand_on_ground
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.errors import InputError, raise_all
 from warpir.core.limits import Limits
@@ -110,7 +110,7 @@ class Loaders:
         self.proxy: Callable[[str, Limits], Asset] = lru_cache(maxsize=1)(_read_proxy)
         self.run: Callable[[str, Limits], EarlierRun] = lru_cache(maxsize=1)(read_run)
         self.points = lru_cache(maxsize=1)(read_point_cloud)
-        self.ground, self.look = FirstGround(), FirstLook()
+        self.ground, self.thumbnail = FirstGround(), FirstThumbnail()
         self.light = read_light
 
 
@@ -164,7 +164,7 @@ def _joined(config: InsertConfig, files: _Files, loaders: Loaders) -> Inputs:
     straight, undistorted_by = _straightened(files)
     ask, place = config.camera, config.placement.place
     world = make_world(ask, place, files.view, files.points, loaders.ground)
-    world = replace(world, look=partial(loaders.look, straight.photo))
+    world = replace(world, thumbnail=partial(loaders.thumbnail, straight.photo))
     mesh = None if files.proxy is None else mesh_of(files.proxy)
     placement = stand_on_ground(
         config.placement, files.asset, world, mesh, config.camera.plane, loaders.must_be_seen

@@ -76,8 +76,9 @@ class PhotoWorld:
     """What was turned, one line each."""
     measured: dict[str, Any] = field(default_factory=dict)
     """What ``run.json`` says of the fit."""
-    look: Callable[[], FloatArray] | None = None
-    """Shows the ground (`warpir.app.standing.small_look`); without it its look does not count."""
+    thumbnail: Callable[[], FloatArray] | None = None
+    """Shows the ground (`warpir.app.standing.thumbnail_of`); without it how that appears does not
+    count."""
 
 
 def photo_camera(

@@ -32,7 +32,7 @@ SHOWN = 0.25
 """The same where it does not."""
 
 
-def small_look(photo: Photo) -> FloatArray:
+def thumbnail_of(photo: Photo) -> FloatArray:
     """Return a photo made small, in which `OpenGround` looks for open ground."""
     shown = photo.exposed()[0]
     share = min(1.0, LOOKED_AT / max(shown.shape[:2]))
@@ -40,8 +40,8 @@ def small_look(photo: Photo) -> FloatArray:
     return resize(shown, height, width)
 
 
-class FirstLook:
-    """Shows for all photos of a sequence that have one size how the first one's ground looks.
+class FirstThumbnail:
+    """Returns the thumbnail of the first photo of a sequence for all that have its size.
 
     Who walks by in a later one would let the object jump.
     """
@@ -50,10 +50,10 @@ class FirstLook:
         self._found: dict[tuple[int, ...], FloatArray] = {}
 
     def __call__(self, photo: Photo) -> FloatArray:
-        """Return `small_look` of the first such photo."""
+        """Return `thumbnail_of` of the first such photo."""
         size = photo.codes.shape[:2]
         if size not in self._found:
-            self._found[size] = small_look(photo)
+            self._found[size] = thumbnail_of(photo)
         return self._found[size]
 
 
@@ -67,8 +67,8 @@ def stand_on_ground(
 ) -> Placement:
     """Set the asset on the ground, so that it neither hovers nor sinks unless that is asked for.
 
-    It stands where it was asked for, or where the points leave space; a ``--place`` outside the
-    photo is refused where it must be seen.
+    It stands where it was asked for, or where the points leave space, or on open ground; a
+    ``--place`` outside the photo is refused where it must be seen.
 
     Raises:
         InputError: There is no such place, or no free one, or the object would be below the ground.
@@ -195,9 +195,9 @@ def _reason(world: PhotoWorld, there: Stand, ground: OpenGround | None) -> str:
 
 def _open_ground(world: PhotoWorld, plane: Float64Array) -> OpenGround | None:
     """Return how the ground looks, where no points tell what stands there."""
-    if world.look is None or world.cloud is not None:
+    if world.thumbnail is None or world.cloud is not None:
         return None
-    return OpenGround.of(world.look(), world.camera, plane)
+    return OpenGround.of(world.thumbnail(), world.camera, plane)
 
 
 def _usual_distance(camera: Camera, plane: Float64Array) -> float:

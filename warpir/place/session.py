@@ -30,7 +30,7 @@ from warpir.app.photo_world import (
     photo_camera,
 )
 from warpir.app.settings import CameraConfig, InputConfig, LightConfig, PlacementConfig
-from warpir.app.standing import small_look, stand_on_ground
+from warpir.app.standing import stand_on_ground, thumbnail_of
 from warpir.calibration.photos import estimate_photo
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.atomic import replacing, write_staged
@@ -119,7 +119,7 @@ def open_session(
     def seen_by(asked: CameraConfig) -> tuple[PhotoWorld, Float64Array, list[str]]:
         view = photo_camera(asked, photo, name, estimate_photo, limits)
         world = make_world(asked, placement.place, view, None)
-        world = replace(world, look=partial(small_look, photo))
+        world = replace(world, thumbnail=partial(thumbnail_of, photo))
         try:
             placed = stand_on_ground(placement, asset, world)
         except InputError as error:

@@ -33,7 +33,7 @@ NEAR, FAR = 1.2, 7.0
 GRID = (25, 24)
 """Number of places tried, across the photo and down."""
 GROUND_ROWS, GROUND_COLUMNS = 0.45, 0.8
-"""Shares of the photo, at its lower edge and about its middle, whose usual look is the ground's."""
+"""Shares of the photo, at its lower edge and about its middle, that mostly show ground."""
 GRAZING = 0.1
 """Sine of the angle to the ground below which a ray may show what stands there [1]."""
 LOOKED_AT = 480
@@ -41,9 +41,9 @@ LOOKED_AT = 480
 BLOCK = 6
 """Side of the blocks of it whose colour and texture are compared [px]."""
 LIKE = 8.0
-"""Difference at which a block counts little for the usual look, in per cent of white."""
+"""Difference at which a block counts little for the usual appearance, in per cent of white."""
 LEAST_RANGE = 3.0
-"""Least difference of open ground from its usual look, where it is all alike, in per cent."""
+"""Least difference of open ground from its usual appearance, where it is all alike, in per cent."""
 ODD_MOST = 5.0
 """Difference over the ground's own beyond which more says no more [1]."""
 OPEN, CLEAR = 1.1, 0.8
@@ -176,7 +176,7 @@ class OpenGround:
     """How unlike the ground a photo looks."""
 
     odd: Float64Array
-    """Difference of a block from the usual look over the ground's own [1], shape [rows, columns]"""
+    """Difference of a block from the usual, over the ground's own [1], shape [rows, columns]."""
 
     @staticmethod
     def of(shown: FloatArray, camera: Camera, plane: Float64Array) -> "OpenGround | None":
@@ -187,21 +187,21 @@ class OpenGround:
             camera: The camera, at any size.
             plane: The ground, unit normal on the camera's side, shape [4].
         """
-        look = _look(shown)
-        rows, columns = look.shape[:2]
+        appearance = _appearance(shown)
+        rows, columns = appearance.shape[:2]
         is_ground = camera.scaled(columns, rows).pixel_rays() @ plane[:3] < -GRAZING
         is_ground[: round((1.0 - GROUND_ROWS) * rows)] = False
         edge = round(0.5 * (1.0 - GROUND_COLUMNS) * columns)
         is_ground[:, :edge] = is_ground[:, columns - edge :] = False
         if is_ground.sum() < LEAST_BLOCKS:
             return None
-        ground = look[is_ground]
+        ground = appearance[is_ground]
         usual = np.median(ground, axis=0)
         # The mode: what stands there moves it less than the mean (mean shift, Cheng 1995).
         for _ in range(8):
             weight = np.exp(-0.5 * ((ground - usual) ** 2).sum(axis=-1) / LIKE**2)
             usual = weight @ ground / weight.sum()
-        away = np.sqrt(((look - usual) ** 2).sum(axis=-1))
+        away = np.sqrt(((appearance - usual) ** 2).sum(axis=-1))
         own = max(float(np.median(away[is_ground])), LEAST_RANGE)
         return OpenGround(np.minimum(away / own, ODD_MOST))
 
@@ -216,7 +216,7 @@ class OpenGround:
         return float(self.odd[row, column].mean()) <= most
 
 
-def _look(shown: FloatArray) -> Float64Array:
+def _appearance(shown: FloatArray) -> Float64Array:
     """Return colour and texture of blocks [per cent of white], shape [rows, columns, 4]."""
     red, green, blue = 100.0 * np.moveaxis(shown, 2, 0).astype(np.float64)
     luma = 0.299 * red + 0.587 * green + 0.114 * blue
@@ -241,14 +241,14 @@ def find_place(
     Of the places where it is seen whole, on ground that has points, with none in its way or in
     front of it, the one nearest to the default pixel and the preferred distance. Where no place
     is like that, the ground may lack points, and then the frame may cut the object. Without points
-    only the frame and the look of the ground decide.
+    only the frame and the appearance of the ground decide.
 
     Args:
         put: Sets the object down at a place; refuses those that the camera cannot see.
         camera: The camera.
         plane: The ground, unit normal on the camera's side, shape [4].
         cloud: The points, if there are any.
-        open_ground: How the ground looks, where that is to count.
+        open_ground: How the ground appears, where that is to count.
 
     Raises:
         InputError: Every place is occupied or hidden, or the photo shows no ground.
