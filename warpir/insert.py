@@ -11,7 +11,7 @@ or from Python, where the module itself can be called:
 
 Checked in this order: arguments, all inputs and the models' files, the output folder and its lock,
 disk space. Warp is imported after these checks, so ``--help``, wrong arguments and ``--validate``
-answer without it. torch is imported where a diffusion model guides, and by nothing else.
+without a card answer without it; torch only where a diffusion model guides.
 """
 
 import sys
@@ -219,25 +219,25 @@ def _run(arguments: list[str]) -> int:
 
 
 def _validate(config: InsertConfig) -> None:
-    """Check everything that can be checked without torch and Warp; write nothing."""
+    """Check everything that can be checked without rendering; write nothing."""
     if config.task.sequence is not None:
         from warpir.sequence.run import check_frames
 
         check_frames(config)
-        return
-    from warpir.app.run import needed_bytes, require_space
+    else:
+        run, _ = _read(config)
+        run.output.check()
+        run.require_room()
+    if config.render.device not in (None, "cpu"):  # only Warp knows whether there is one
+        from warpir.render.device import choose_device
 
-    run, _ = _read(config)
-    run.output.check()
-    require_space(run.output.path, needed_bytes(run.config, run.inputs))
+        choose_device(config.render.device)
 
 
 class _CallableModule(ModuleType):
     """Lets ``from warpir import insert; insert(config)`` work, and ``pool.map(insert, ...)``."""
 
-    def __call__(self, config: InsertConfig, *, renews: bool = False) -> Insertion:
-        """Insert one object; see `insert`."""
-        return insert(config, renews=renews)
+    __call__ = staticmethod(insert)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return import_module, (self.__name__,)

@@ -41,8 +41,9 @@ def test_device_that_is_not_there(
     inputs: Path, device: str, env: dict[str, str] | None, words: str
 ) -> None:
     argv = arguments(inputs, "out", device=device)
-    lines = assert_fails(argv, 2, "--device", words, cwd=inputs, env=env)
-    assert "--device cpu" in lines[1]
+    for wanted in (argv, [*argv, "--validate"]):
+        lines = assert_fails(wanted, 2, "--device", words, cwd=inputs, env=env)
+        assert "--device cpu" in lines[1]
 
 
 @pytest.mark.parametrize("name", [None, "cuda", "cuda:0"])
