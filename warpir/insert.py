@@ -51,8 +51,7 @@ class Insertion:
     out: Path
     """Folder of the files."""
     files: tuple[str, ...]
-    """Names of the files in `out`, ``run.json`` last; of a sequence, the composites and
-    ``sequence.json``."""
+    """Names in `out`, ``run.json`` last; of a sequence, the composites and ``sequence.json``."""
     record: dict[str, Any]
     """Content of the last file; ``run.json`` holds inputs, settings, assumptions, device and
     seconds."""
@@ -83,6 +82,8 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
     Raises:
         InputError: An input or the output folder cannot be used; no result was written.
     """
+    if not isinstance(config, InsertConfig):
+        raise TypeError(f"insert takes an InsertConfig (found {type(config).__name__})")
     config.require_inputs()
     with _ONE_AT_A_TIME:
         if config.task.sequence is not None:

@@ -978,6 +978,8 @@ def test_insert_is_called_through_the_module() -> None:
         insert(InsertConfig(out="o"))
     with pytest.raises(InputError, match="--photo: needed"):
         insert.insert(InsertConfig(out="o"))
+    with pytest.raises(TypeError, match=r"takes an InsertConfig \(found str\)"):
+        insert("photo.jpg")
     assert pickle.loads(pickle.dumps(insert)) is insert, "a pool of processes can be given it"
     assert "renews" in inspect.signature(insert).parameters
 
