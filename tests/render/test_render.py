@@ -1080,3 +1080,14 @@ def test_load_kernels_says_how_many_are_there() -> None:
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert len(shares) == len(set(shares)) > 3
+
+
+@pytest.mark.parametrize("shape", [(32,), (4, 8)])
+def test_mask_is_not_taken_for_pixel_numbers(shape: tuple[int, ...]) -> None:
+    """Its values are 0 and 1: the picture was that of the first two pixels, over and over."""
+    renderer = make(card(Material()), CARD_VIEW, "cpu")
+    light, mask = light_args(constant(), renderer.device), np.ones(shape, np.bool_)
+    with pytest.raises(TypeError, match="expected row-major indices"):
+        renderer.foreground(light, mask, 1, 1, 1, 0)
+    with pytest.raises(TypeError, match="expected row-major indices"):
+        renderer.receiver(light, mask, np.ones(shape, np.int32), 1, 1, 0)

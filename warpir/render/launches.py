@@ -60,7 +60,7 @@ def geometry_of(
         trace_gbuffer,
         count,
         [
-            Rows(renderer.upload(pixels, wp.int32)),
+            Rows(renderer.upload_pixels(pixels)),
             scene.camera_args,
             *scene.geometry(),
             spp,
@@ -157,7 +157,7 @@ class ObjectLaunch:
             kernel,
             len(pixels),
             [
-                Rows(renderer.upload(pixels, wp.int32)),
+                Rows(renderer.upload_pixels(pixels)),
                 hidden,
                 self.camera_args,
                 *scene.geometry(self.materials),
@@ -234,7 +234,7 @@ class ReceiverLaunch:
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
         seen = [
-            Rows(renderer.upload(pixels, wp.int32)),
+            Rows(renderer.upload_pixels(pixels)),
             Rows(renderer.upload(may_see_object, wp.int32)),
             self.camera_args,
             *renderer.scene.shadow_geometry(),
@@ -279,7 +279,7 @@ class ReceiverLaunch:
             trace_lamps,
             len(pixels),
             [
-                Rows(renderer.upload(pixels, wp.int32)),
+                Rows(renderer.upload_pixels(pixels)),
                 Rows(renderer.upload(may_see_object, wp.int32)),
                 self.camera_args,
                 *renderer.scene.shadow_geometry(),

@@ -50,7 +50,7 @@ def place_slopes(
         kernel: wp.Kernel, outputs: int, pixels: IntArray, *args: object
     ) -> list[FloatArray]:
         out = [renderer.zeros(len(pixels), wp.mat33) for _ in range(outputs)]
-        given = [Rows(renderer.upload(pixels, wp.int32)), *args, seed, *map(Rows, out)]
+        given = [Rows(renderer.upload_pixels(pixels)), *args, seed, *map(Rows, out)]
         renderer.launch(kernel, len(pixels), given, spp * depth, "lamps")
         planes = tuple(a.numpy()[: len(pixels)] for a in out)
         width = scene.camera.width

@@ -112,7 +112,7 @@ class _ObjectTrace:
         points, emission = _surface_points(renderer, pixels, subsamples, seed)
         texel_count = texels.height * texels.width
         T = wp.zeros((len(pixels), texel_count), dtype=wp.vec3, device=renderer.device)
-        launched = Rows(renderer.upload(pixels, wp.int32))
+        launched = Rows(renderer.upload_pixels(pixels))
         renderer.launch(
             trace_direct,
             len(pixels),
