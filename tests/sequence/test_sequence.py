@@ -424,9 +424,10 @@ def test_a_frame_without_the_camera_of_the_others_is_told(
         (b"", "frames miscounted (found 0"),
         (b"\n \n", "frames miscounted (found 0"),
         (b"{}\n" * 10_000, "frames miscounted (found 10000"),
-        (b"\xff\xfe\n", "not UTF-8"),
+        (b'{"photo": "\xff\xfe"}\n', "not UTF-8"),
+        (b"\xff\xfe\n", "not JSON lines"),
     ],
-    ids=["missing", "empty", "blank", "many", "binary"],
+    ids=["missing", "empty", "blank", "many", "latin", "binary"],
 )
 def test_bad_sequence_file(
     content: bytes | None, words: str, inputs: Path, first: Run, tmp_path: Path

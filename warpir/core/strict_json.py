@@ -19,6 +19,7 @@ JSON = Faults(
         "line_count": "{what} miscounted",
         "long_integer": "not JSON that can be read (a number of 5000 digits)",
         "missing": "no such file",
+        "lines": "not JSON lines",
         "nesting": "JSON nested too deeply (limit {limit}); --max-nesting raises it",
         "not_an_object": "not a JSON object",
         "not_regular": "not a regular file",
@@ -138,18 +139,20 @@ def read_json_lines(
         The number and the bytes of each line that is not blank, and the sha256 of the whole file.
 
     Raises:
-        InputError: Missing, too large, or of another number of lines (`ExitCode.USAGE`).
+        InputError: Missing, too large, of another format, such as CSV or a JSON list, or of another
+            number of lines (`ExitCode.USAGE`).
     """
     try:
         raw = _read(Path(path), limits)
+        lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
+        if not 1 <= len(lines) <= most:
+            expected = f"1 to {most}"
+            raise JSON.error(path, "line_count", what=what, found=len(lines), expected=expected)
+        if b"{" not in raw or raw.lstrip().startswith(b"["):
+            raise JSON.error(path, "lines", expected="an object {...} on each line")
     except InputError as error:
         error.code = ExitCode.USAGE
         raise
-    lines = [(number, line) for number, line in enumerate(raw.split(b"\n"), 1) if line.strip()]
-    if not 1 <= len(lines) <= most:
-        wrong = JSON.error(path, "line_count", what=what, found=len(lines), expected=f"1 to {most}")
-        wrong.code = ExitCode.USAGE
-        raise wrong
     return lines, hashlib.sha256(raw).hexdigest()
 
 
