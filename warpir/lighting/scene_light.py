@@ -224,7 +224,7 @@ def _ring(inputs: Inputs) -> Float64Array:
     rings = np.linspace(0.2, 1.5, 16) * size
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     if inputs.proxy is not None:
-        # Every triangle is tried for each of them.
+        # Each of them is looked for through the mesh.
         rings, angles = rings[1::4], angles[::4]
     side = np.cross(placement.ground[:3], camera.c2w[:3, 0])
     across = np.cross(side, placement.ground[:3])

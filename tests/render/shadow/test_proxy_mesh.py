@@ -43,6 +43,7 @@ from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.rows import TransportSettings
 from warpir.report.result import NO_MASK_HANDED_OVER, NO_MESH_HANDED_OVER
+from warpir.scene import receiver
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.camera import Camera
 from warpir.scene.lamps import lamp_axes, without_lamps
@@ -423,6 +424,39 @@ def test_first_hit_is_that_of_the_kernels(device: str) -> None:
     np.testing.assert_allclose(distance[inside < -0.2], 9.0 / -rays[inside < -0.2, 2], rtol=1e-12)
     assert (triangle[inside < -0.2] >= len(ball.indices) - 2).all()
     assert np.isinf(first_hit(ball, np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))[0]).all()
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 700])
+def test_first_hit_is_the_nearest_of_all_triangles(count: int) -> None:
+    """Corners on a lattice: rays run within sides of boxes, and meet triangles at shared edges."""
+    rng = np.random.default_rng(count)
+    corners = rng.integers(-3, 4, (30, 3)).astype(np.float64)
+    soup = ReceiverMesh(corners, rng.integers(0, 30, (count, 3)).astype(np.int32))
+    origins = rng.integers(-4, 5, (90, 3)).astype(np.float64)
+    directions = np.concatenate([np.tile(np.eye(3), (10, 1)), rng.normal(size=(60, 3))])
+    distance, triangle = first_hit(soup, origins, directions)
+    every = np.tile(np.arange(count), 90)
+    met = receiver._reach(soup, every, *(np.repeat(a, count, 0) for a in (origins, directions)))
+    np.testing.assert_array_equal(distance, met.reshape(90, count).min(axis=1))
+    is_met = np.isfinite(distance)
+    assert is_met.any() and not is_met.all()
+    np.testing.assert_array_equal(triangle[is_met], met.reshape(90, count).argmin(axis=1)[is_met])
+
+
+def test_first_hit_looks_at_few_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan of a place has a million, in any order; all for each ray took 5 s of 64 rays."""
+    rows, columns = np.indices((80, 80)).reshape(2, -1)
+    corners = np.stack([columns, np.sin(rows) * 0.1, rows], axis=1).astype(np.float64)
+    first = (rows * 80 + columns)[(rows < 79) & (columns < 79)]
+    faces = np.concatenate([first[:, None] + (0, 80, 1), first[:, None] + (1, 80, 81)])
+    place = ReceiverMesh(corners, np.random.default_rng(0).permutation(faces).astype(np.int32))
+    tested, reach = [], receiver._reach
+    monkeypatch.setattr(receiver, "_reach", lambda *a: tested.append(len(a[1])) or reach(*a))
+    toward = np.stack([np.linspace(1, 78, 64), np.full(64, -5.0), np.linspace(78, 1, 64)], axis=1)
+    eye = np.array([40.0, 5.0, 40.0])
+    distance = first_hit(place, np.tile(eye, (64, 1)), toward - eye + (0.01, 0.0, 0.02))[0]
+    assert np.isfinite(distance).all()
+    assert sum(tested) < 0.02 * 64 * len(faces)
 
 
 def test_view_of_a_place() -> None:
