@@ -1,6 +1,7 @@
 """The training command, and trainings that several processes share."""
 
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,13 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.builders.image_files import write_envmap
 from tests.lighting.test_regressor import HELD_OUT, SMALL, TOY, blobs
 from warpir.core.errors import ExitCode
 from warpir.train import command
+from warpir.train.camera.crops import CameraBatch, draw_batch
 from warpir.train.command import main
-from warpir.train.networks.calibrator import random_calibrator, save_calibrator
+from warpir.train.networks.calibrator import (
+    CalibratorConfig,
+    random_calibrator,
+    read_calibrator,
+    save_calibrator,
+)
 from warpir.train.networks.regressor import random_regressor, save_regressor
 from warpir.train.places import learned_from
 from warpir.train.regressor import train_regressor
@@ -135,6 +143,29 @@ def test_the_cameras_training_heeds_its_rate(
     argv = ["camera", "--panoramas", str(tmp_path), "--out", str(tmp_path / "out"), *given]
     assert main([*argv, "--device", "cpu"]) == ExitCode.DONE
     assert rates == [rate]
+
+
+def test_a_signal_ends_the_cameras_training_with_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It held nothing on disk until its time was over."""
+    drawn = []
+
+    def draw(*given: Any) -> CameraBatch:
+        drawn.append(given)
+        if len(drawn) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return draw_batch(*given)
+
+    monkeypatch.setattr("warpir.train.camera.loop.draw_batch", draw)
+    small = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
+    start, weights = tmp_path / "start.safetensors", tmp_path / "out" / "calibrator.safetensors"
+    save_calibrator(random_calibrator(0, small), start, {})
+    write_envmap(tmp_path / "place", "place", np.full((16, 32, 3), 0.5, np.float32))
+    argv = ["camera", "--panoramas", str(tmp_path), "--out", str(weights.parent), "--batch", "2"]
+    assert main([*argv, "--device", "cpu", "--start", str(start)]) == 128 + signal.SIGINT
+    assert read_calibrator(weights, torch.device("cpu")).record["steps"] == 2
+    assert f"stopped by SIGINT; kept: {weights}; --start" in capsys.readouterr().err
 
 
 @pytest.mark.case("F5")

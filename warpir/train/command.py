@@ -27,6 +27,7 @@ from warpir.app.config import usage
 from warpir.app.program import run_program, say
 from warpir.core.atomic import Checkpoints
 from warpir.core.errors import ExitCode, InputError
+from warpir.core.signals import Stopped
 
 if TYPE_CHECKING:
     import torch
@@ -146,7 +147,7 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
 
     from warpir.render.device import choose_device
     from warpir.train.camera.crops import read_panoramas
-    from warpir.train.camera.loop import begin_with_trunk, train_camera
+    from warpir.train.camera.loop import WEIGHTS, begin_with_trunk, train_camera
     from warpir.train.lights import SKY_ONLY
     from warpir.train.networks.calibrator import random_calibrator, read_calibrator
     from warpir.train.networks.regressor import read_regressor
@@ -182,17 +183,23 @@ def _train_camera(options: argparse.Namespace, panoramas: Sequence[Path]) -> dic
         learning_rate=options.rate
         or CameraSettings.learning_rate * (1.0 if start is None else 0.5),
     )
-    return train_camera(
-        read_panoramas(learned, device),
-        read_panoramas(watched, device) if watched else None,
-        options.out,
-        settings,
-        device,
-        options.minutes,
-        seed=options.seed,
-        start=start,
-        record=record,
-    )
+    try:
+        return train_camera(
+            read_panoramas(learned, device),
+            read_panoramas(watched, device) if watched else None,
+            options.out,
+            settings,
+            device,
+            options.minutes,
+            seed=options.seed,
+            start=start,
+            record=record,
+        )
+    except Stopped as stopped:
+        weights = options.out / WEIGHTS  # `_check` has found none
+        if weights.exists():
+            stopped.kept = f"kept: {weights}; --start {weights} and another --out go on from there"
+        raise
 
 
 def _say_known(watched: Sequence[Path], known: set[str]) -> None:

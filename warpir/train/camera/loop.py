@@ -1,7 +1,8 @@
 """The training loop of the network that estimates cameras.
 
 It takes minutes, so it is not resumed; a training that shall go on starts from the weights of
-another. What is kept is the best moving average of the weights on places that are only looked at.
+another. A signal ends it early, with what it has until then; a second one at once. What is kept is
+the best moving average of the weights on places that are only looked at.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from warpir.app.program import say
 from warpir.calibration.network import NUMBERS
+from warpir.core import signals
 from warpir.train.camera.crops import CameraBatch, Panoramas, draw_batch
 from warpir.train.networks.calibrator import (
     CalibratorModule,
@@ -74,6 +76,7 @@ def train_camera(
 
     Raises:
         OSError: The results cannot be written.
+        Stopped: A signal has ended it; what was trained is in ``out``.
     """
     out.mkdir(parents=True, exist_ok=True)
     (out / CURVE).unlink(missing_ok=True)
@@ -87,20 +90,20 @@ def train_camera(
     generator = torch.Generator(device).manual_seed(seed)
     torch.manual_seed(seed)
     began = validated = time.monotonic()
-    while (progress := (time.monotonic() - began) / (60.0 * minutes)) < 1.0:
-        with torch.no_grad():
-            batch = draw_batch(learned, settings.batch, generator)
-        course.follow(step(batch, _rate(settings, progress, course.steps)), settings.average)
-        if validation and time.monotonic() - validated >= 60.0 * settings.validate_minutes:
-            course.validate(progress * minutes)
-            validated = time.monotonic()
-    finished: dict[str, float] = {}
-    if validation:
-        course.validate(minutes)
-        calibrate(course.kept, validation)
-        finished = measure(course.kept, validation)
-    known |= {"steps": course.steps, "minutes": minutes, "validation": finished}
-    save_calibrator(course.kept, out / WEIGHTS, known)
+    with signals.deferred():
+        while (progress := (time.monotonic() - began) / (60.0 * minutes)) < 1.0:
+            with torch.no_grad():
+                batch = draw_batch(learned, settings.batch, generator)
+            course.follow(step(batch, _rate(settings, progress, course.steps)), settings.average)
+            if signals.is_pending():
+                break
+            if validation and time.monotonic() - validated >= 60.0 * settings.validate_minutes:
+                course.validate(progress * minutes)
+                validated = time.monotonic()
+        minutes *= min(progress, 1.0)
+        finished = course.finish(minutes)
+        known |= {"steps": course.steps, "minutes": minutes, "validation": finished}
+        save_calibrator(course.kept, out / WEIGHTS, known)
     return finished
 
 
@@ -130,6 +133,14 @@ class _Course:
         line = {"step": self.steps, "minutes": round(minutes, 3), "loss": float(self.loss)} | found
         with self.curve.open("a", encoding="utf-8") as curve:
             curve.write(json.dumps(line, allow_nan=False) + "\n")
+
+    def finish(self, minutes: float) -> dict[str, float]:
+        """Calibrate the best average and return what it reaches; nothing without validation."""
+        if not self.validation:
+            return {}
+        self.validate(minutes)
+        calibrate(self.kept, self.validation)
+        return measure(self.kept, self.validation)
 
 
 def _rate(settings: CameraSettings, progress: float, steps: int) -> float:
