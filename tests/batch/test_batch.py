@@ -320,6 +320,22 @@ def test_a_sequence_is_one_scene(memory: Path, monkeypatch: pytest.MonkeyPatch) 
 # ------------------------------------------------------------------------------- what is refused
 
 
+def test_a_failed_scene_tells_of_an_earlier_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is in its folder then is not what the line asks for."""
+    manifest = write_manifest(tmp_path, [{"name": "a", "fotos": 1}, {"name": "b", "fotos": 1}])
+    (tmp_path / "out" / "a").mkdir(parents=True)
+    (tmp_path / "out" / "a" / "run.json").write_text("{}")
+    assert main([str(manifest), "--out", str(tmp_path / "out"), *FLAGS]) == ExitCode.USAGE
+    told = f"{tmp_path / 'out' / 'a'} holds the result of an earlier run"
+    assert [line for line in capsys.readouterr().out.splitlines() if "earlier" in line] == [
+        f"notice: {told}"
+    ]
+    listed = (tmp_path / "out" / "failures.jsonl").read_text().splitlines()
+    assert [told in json.loads(line)["more"] for line in listed] == [True, False]
+
+
 def test_validate_looks_at_all_lines_and_writes_nothing(
     memory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -73,7 +73,7 @@ class Batch:
 
     def __init__(self, options: Options, manifest: Manifest) -> None:
         self.options, self._digest = options, manifest.sha256
-        self.scenes = tuple(Scene(row) for row in manifest.rows)
+        self.scenes = tuple(Scene(row, options.out) for row in manifest.rows)
         self.started = time.monotonic()
         self.worker_count = self.threads = 0
         self._workers: Workers = LocalWorkers([])

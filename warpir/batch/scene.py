@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from warpir.app.program import say
@@ -20,6 +21,8 @@ class Scene:
     """A line of the manifest, and what became of it."""
 
     row: Row
+    out: Path
+    """Folder of the batch."""
     state: str = "not run"
     """One of `STATES`."""
     status: int = 0
@@ -48,8 +51,12 @@ class Scene:
         # A signal that came to this scene alone is none of the batch's.
         self.status = status if status < 128 else ExitCode.RESOURCES
         self.state, self.lines = "failed", tuple(lines)
-        say(f"line {self.row.line}{f', {self.row.name}' if self.row.name else ''}: failed "
-            f"({self.status}): {self.reason}")  # fmt: skip
+        line = f"line {self.row.line}{f', {self.row.name}' if self.row.name else ''}"
+        say(f"{line}: failed ({self.status}): {self.reason}")
+        folder = self.out / str(self.row.name)
+        if any((folder / name).exists() for name in ("run.json", "sequence.json")):
+            self.lines += (f"{folder} holds the result of an earlier run",)
+            say(f"notice: {self.lines[-1]}")
 
     @property
     def reason(self) -> str:
