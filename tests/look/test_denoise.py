@@ -11,6 +11,7 @@ needs_oidn = pytest.mark.skipif(
     denoise.denoiser_version() is None, reason="pyoidn is not installed"
 )
 SIZE = (80, 100)
+NONE = np.zeros(0, np.int32)
 
 
 def disc() -> tuple[IntArray, FloatArray]:
@@ -39,7 +40,7 @@ def test_window_holds_its_pixels() -> None:
 def test_no_shadow_needs_no_network() -> None:
     """Nothing to filter comes back as it is."""
     nothing = np.zeros((0, 3), np.float32)
-    assert denoised_ratio(nothing, np.zeros(0, np.int32), SIZE) is nothing
+    assert denoised_ratio(nothing, NONE, NONE, SIZE) is nothing
     pixels = np.array([5], np.int32)
     part = np.ones((1, 3), np.float32)
     bare = denoised_object((part,), np.zeros(1, np.float32), part, part, pixels, SIZE)
@@ -73,8 +74,21 @@ def test_noise_of_a_shadow_is_taken_out() -> None:
     noise = 0.08 * np.random.default_rng(1).normal(size=clean.shape)
     noisy = np.clip(clean + noise, 0.0, 1.0).astype(np.float32)
     assert (noisy == 1.0).any()
-    found = denoised_ratio(noisy, pixels, SIZE)
+    found = denoised_ratio(noisy, pixels, NONE, SIZE)
     assert (found[noisy == 1.0] == 1.0).all() and found.max() <= 1.0 and found.min() >= 0.0
     below = noisy < 1.0
     before, after = (np.sqrt(((r - clean)[below] ** 2).mean()) for r in (noisy, found))
     assert after < 0.5 * before
+
+
+@needs_oidn
+def test_shadow_beside_the_object_stays_dark() -> None:
+    """Lit ground that the object hides gave what it does not cover of its rim 0.03 of light."""
+    distance = np.hypot(*(np.indices(SIZE) - np.reshape((40, 50), (2, 1, 1)))).reshape(-1)
+    covered, around = distance < 15.3, (distance >= 15.3) & (distance < 30.0)
+    pixels, hidden = (np.flatnonzero(p).astype(np.int32) for p in (around, covered))
+    noise = 0.1 * np.random.default_rng(0).normal(size=(len(pixels), 1))
+    noisy = (np.clip(0.3 + noise, 0.0, 0.9) * np.ones((1, 3))).astype(np.float32)
+    found = denoised_ratio(noisy, pixels, hidden, SIZE)
+    beside = distance[pixels] < 16.3
+    assert abs(float((found - noisy)[beside].mean())) < 0.01

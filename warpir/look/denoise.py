@@ -20,6 +20,8 @@ from warpir.core.arrays import BoolArray, FloatArray, IntArray
 
 MARGIN = 16
 """Pixels around what is filtered, filled from its edge: the network looks that far."""
+MEAN_SIGMA = 3.0
+"""Deviation of the weights of a mean about a pixel [px]."""
 LEAST_COVERAGE = 0.02
 """Coverage from which a pixel's colour is known well enough to fill others [1]."""
 
@@ -66,6 +68,11 @@ class Window:
         plane[self.rows] = values
         return plane.reshape(*self.shape, *values.shape[1:])
 
+    def cut(self, plane: BoolArray) -> BoolArray:
+        """Return the part of a plane of the whole picture that is in the window."""
+        (top, left), (height, width) = self.corner, self.shape
+        return plane[top : top + height, left : left + width]
+
     def gather(self, plane: FloatArray) -> FloatArray:
         """Return the rows of values of a picture."""
         rows: FloatArray = plane.reshape(-1, *plane.shape[2:])[self.rows]
@@ -106,18 +113,25 @@ def denoised_object(
     return tuple(found)
 
 
-def denoised_ratio(ratio: FloatArray, pixels: IntArray, size: tuple[int, int]) -> FloatArray:
+def denoised_ratio(
+    ratio: FloatArray, pixels: IntArray, hidden: IntArray, size: tuple[int, int]
+) -> FloatArray:
     """Return a shadow ratio without noise; where a channel is exactly 1 it stays exactly 1.
 
     Args:
-        ratio: Of the traced pixels [1]; that of all others is 1; shape [N, 3].
+        ratio: Of the traced pixels [1]; that of other ground is 1; shape [N, 3].
         pixels: Row-major indices in the picture, shape [N].
+        hidden: Those of pixels without ground, which are filled from beside them: lit ground there
+            would brighten the shadow that reaches the object; shape [M].
         size: Height and width of the picture [px].
     """
     if len(pixels) == 0:
         return ratio
     window = Window.around(pixels, *size)
-    clean = window.gather(_filter(window.spread(ratio, outside=1.0)))
+    is_ground = np.ones(size, bool)
+    is_ground.reshape(-1)[hidden] = False
+    filled = _continued(window.spread(ratio, outside=1.0), window.cut(is_ground))
+    clean = window.gather(_filter(filled))
     most = max(1.0, float(ratio.max()))
     return np.where(ratio == 1.0, ratio, np.clip(clean, 0.0, most)).astype(np.float32)
 
@@ -127,6 +141,19 @@ def _filled(plane: FloatArray, known: BoolArray) -> FloatArray:
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled: FloatArray = plane[tuple(nearest)]
     return filled
+
+
+def _continued(plane: FloatArray, known: BoolArray) -> FloatArray:
+    """Return a plane in which unknown pixels have the mean about the nearest known one.
+
+    One noisy pixel, spread far, would look like something that is there.
+    """
+    weight = known[..., None].astype(np.float32)
+    sums, weights = (
+        ndimage.gaussian_filter(p, (MEAN_SIGMA, MEAN_SIGMA, 0)) for p in (plane * weight, weight)
+    )
+    mean = _filled(sums / np.maximum(weights, 1e-6), known)
+    return np.where(known[..., None], plane, mean).astype(np.float32)
 
 
 def _filter(colour: FloatArray, *guides: FloatArray) -> FloatArray:

@@ -88,7 +88,8 @@ def render(
     if quality.is_denoised:
         camera = renderer.scene.camera
         foreground = _denoised(foreground, gbuffer, camera)
-        ratio = denoised_ratio(ratio, receiver_pixels, (camera.height, camera.width))
+        covered = gbuffer.object_pixels[foreground.mask >= 1.0]
+        ratio = denoised_ratio(ratio, receiver_pixels, covered, (camera.height, camera.width))
     fg, beta = tone_mapped(renderer, foreground, ratio, curves)
     planes = _planes(renderer.scene.camera, gbuffer, foreground, fg, (receiver_pixels, beta))
     if quality.ground_roughness is not None:
