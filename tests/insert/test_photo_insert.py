@@ -103,6 +103,17 @@ def test_linear_plates_survive_in_the_layers(inputs: Path, tmp_path: Path, case:
     assert any("composite.png clips" in notice for notice in done.record["notices"])
 
 
+def test_response_is_not_for_a_linear_plate(
+    inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its curve is of photographs: a plate of ten times the unit had a twentieth of the effect."""
+    plate = np.full((*SIZE[::-1], 3), 0.2, np.float32)
+    path = write_image(tmp_path / "p.exr", plate)
+    argv = arguments(inputs, tmp_path / "out", photo=str(path), response="1.5")
+    assert main([*argv, "--validate"]) == ExitCode.USAGE
+    assert "--response: a scene-linear plate has none" in capsys.readouterr().err
+
+
 @pytest.mark.case("E8")
 def test_e8_layer_is_used_and_recorded(inputs: Path, tmp_path: Path) -> None:
     """--layer reaches the reader; without it the run ends with the layers' names."""

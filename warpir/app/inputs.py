@@ -215,7 +215,6 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
         if state is not None and name in PICTURES:  # all of it is read for its sha256
             attempt(partial(limits.check, "file_bytes", state[1], path, "too large", more=" bytes"))
     photo = attempt(lambda: loaders.photo(inputs, limits))
-    attempt(lambda: _check_width(config.render.width, photo, limits))
     occluder = attempt(lambda: _read_mask(inputs.occluder_mask, photo, limits, log))
     shaded = attempt(lambda: _read_mask(config.camera.shadow_mask, photo, limits, log))
     asset = attempt(lambda: read_asset(inputs, limits, loaders, log))
@@ -225,6 +224,7 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     if (reuse := given.reuse) is not None:
         run = attempt(lambda: loaders.run(reuse, limits))
     if photo is not None:
+        attempt(lambda: _check_photo(config, photo))
         name = Path(str(inputs.photo)).name
         # What stops the run anyway is not worth the seconds of an estimate.
         estimator = None if problems else loaders.estimator
@@ -252,18 +252,18 @@ def _read_files(config: InsertConfig, loaders: Loaders) -> _Files:
     )
 
 
-def _check_width(width: int | None, photo: Photo | None, limits: Limits) -> None:
-    """Refuse a width that enlarges the photo beyond what a photo may have.
+def _check_photo(config: InsertConfig, photo: Photo) -> None:
+    """Refuse a width that enlarges the photo too far, and a camera's response for a linear plate.
 
     Raises:
-        InputError: It would be rendered at too many pixels.
+        InputError: It would be rendered at too many pixels, or bent by a curve of photographs.
     """
-    if photo is None or width is None:
-        return
-    rows, columns = photo.codes.shape[:2]
+    (rows, columns), width = photo.codes.shape[:2], config.render.width or 0
     if width > columns:
         rendered = width * round(width * rows / columns)
-        limits.check("pixels", rendered, "--width", "too many pixels to render")
+        config.limits.check("pixels", rendered, "--width", "too many pixels to render")
+    if photo.is_linear and not isinstance(config.look.response, str):
+        raise usage("--response", "a scene-linear plate has none", "leave it out")
 
 
 def _hashes_beside(config: InsertConfig, asset: Asset, proxy: Asset | None) -> dict[str, str]:
