@@ -381,6 +381,24 @@ def test_page_that_is_loaded_again_goes_on(inputs: Path, tmp_path: Path) -> None
 
 @needs_chromium
 @pytest.mark.slow
+def test_second_tab_is_told_of_a_save(inputs: Path, tmp_path: Path) -> None:
+    """Both save into one file: its placement was replaced without a word."""
+    with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
+        with opened.page.expect_popup() as popup:
+            opened.page.evaluate("void window.open(location.href)")
+        other = Opened(popup.value)
+        other.page.wait_for_selector("#save:not([disabled])", timeout=60_000)
+        for saving, told in ((other, opened), (opened, other)):
+            saving.page.bring_to_front()
+            save(saving)
+            assert saving.page.locator("#problem").is_hidden()
+            told.page.bring_to_front()
+            told.page.wait_for_selector("text=Another tab has saved")
+            told.page.wait_for_selector("#done", state="hidden")
+
+
+@needs_chromium
+@pytest.mark.slow
 def test_page_tells_of_a_browser_that_cannot_draw(inputs: Path, tmp_path: Path) -> None:
     with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
         opened.page.add_init_script(NO_WEBGL)

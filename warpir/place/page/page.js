@@ -337,6 +337,7 @@ function showSaved(sent, command) {
   $('command').textContent = command;
   saved = sent;
   draw();
+  others.postMessage('saved');
 }
 
 async function save() {
@@ -359,6 +360,14 @@ async function save() {
 // A page that is loaded again, also by a browser that was short of memory, goes on where it was, by
 // a change that undo takes back. The address has the session's token, and storage may be refused.
 const KEPT = `placing ${location.pathname}`;
+
+// Another tab of this session saves into the same file.
+const others = new BroadcastChannel(KEPT);
+others.onmessage = () => {
+  saved = null;
+  draw();
+  tell('Another tab has saved its placement; a save here replaces that.');
+};
 
 function keep() {
   try {
