@@ -55,8 +55,6 @@ class Plan:
 
     width: int = 384
     height: int = 256
-    maps: tuple[tuple[int, int], ...] = ((32, 32), (16, 16), (48, 48))
-    """Rows of the map for the foreground and for the shadow; the first pair is the main one."""
     mis_spp: tuple[int, ...] = (4, 16, 64, 256)
     mitsuba_spp: tuple[int, ...] = (4, 16, 64, 256, 1024)
     transport: tuple[dict[str, Any], ...] = (
@@ -65,20 +63,16 @@ class Plan:
         {"subsamples": 64, "paths": 128, "bright_directions": 4096},
         {"expects_light": False},
     )
-    """Settings beside the map, see `Transport`; maps after the first take the first alone."""
-    reference_spp: int = 2048
-    own_reference_spp: int = 512
-    rounds: int = 5
+    """Settings, see `Transport`."""
+    rounds: int = 3
     """Runs of each candidate, in turn with all others."""
     transport_rounds: int = 2
     """Rounds in which transport is traced again."""
-    budget_s: float = 30.0
+    budget_s: float = 10.0
     """A candidate that would take longer than this in all is not run again."""
 
 
-SMALL = {"width": 96, "height": 64, "maps": ((32, 32),), "transport": ({},)}
-SHORT = {"mis_spp": (4, 16, 64), "mitsuba_spp": (4, 64, 1024), "rounds": 3, "transport_rounds": 1}
-QUICK = Plan(**SMALL, **SHORT, budget_s=2.0)
+QUICK = Plan(96, 64, (4, 16, 64), (4, 64, 1024), ({},), transport_rounds=1, budget_s=2.0)
 WARM_TRANSPORT = {"subsamples": 1, "bright_directions": 0, "paths": 1}
 
 
@@ -110,13 +104,11 @@ class Runs:
         self.seconds_step.append(end - middle)
         return images(), download()
 
-    def judge(
-        self, found: tuple[Images, Step], references: References, heights: dict[str, int]
-    ) -> None:
+    def judge(self, found: tuple[Images, Step], references: References) -> None:
         """Add the errors of the forward image and of a step's image and gradient."""
         images, step = found
         for part, (image, gradient) in step.items():
-            reference = references.by_map[part, heights[part]]
+            reference = references.by_part[part]
             errors = reference.rmse((image, gradient))
             errors["forward"] = reference.rmse((images[part], gradient))["image"]
             self.rmse.setdefault(part, []).append(errors)
@@ -142,15 +134,10 @@ def measure_scene(bench: Bench, plan: Plan, references: References) -> list[dict
     """Run every candidate of a scene in turn; return its rows."""
     parts: list[MisPart | MitsubaPart] = []
     for part in PARTS:
-        for k, height in enumerate(bench.heights[part]):
-            # Maps after the first: every other point, the curves are straight
-            step = 1 if k == 0 else 2
-            parts += [MisPart(bench, part, height, spp) for spp in plan.mis_spp[::step]]
-            parts += [MitsubaPart(bench, part, height, spp) for spp in plan.mitsuba_spp[::step]]
-    wholes = [(plan.maps[0], settings) for settings in plan.transport]
-    wholes += [(heights, plan.transport[0]) for heights in plan.maps[1:]]
+        parts += [MisPart(bench, part, spp) for spp in plan.mis_spp]
+        parts += [MitsubaPart(bench, part, spp) for spp in plan.mitsuba_spp]
     name = bench.scene.name
-    Transport(bench, plan.maps[0], WARM_TRANSPORT, seed=0).warm()
+    Transport(bench, WARM_TRANSPORT, seed=0).warm()
     warmed: set[tuple[Any, ...]] = set()
     for candidate in parts:
         if candidate.warm_key not in warmed:
@@ -159,7 +146,7 @@ def measure_scene(bench: Bench, plan: Plan, references: References) -> list[dict
     log(f"{name}: kernels are warm")
 
     part_runs = [Runs() for _ in parts]
-    whole_runs = [Runs() for _ in wholes]
+    whole_runs = [Runs() for _ in plan.transport]
     for k in range(plan.rounds):
         for candidate, runs in zip(parts, part_runs, strict=True):
             if k > 0 and runs.spent * (k + 1) / k > plan.budget_s:
@@ -169,46 +156,33 @@ def measure_scene(bench: Bench, plan: Plan, references: References) -> list[dict
             found = runs.time(candidate, RUN_SEED + k)
             if k == 0:
                 runs.peak_mib = bench.memory.stop()
-            runs.judge(found, references, {candidate.part: candidate.height})
+            runs.judge(found, references)
         if k < plan.transport_rounds:
-            for (heights, settings), runs in zip(wholes, whole_runs, strict=True):
-                _measure_transport(bench, heights, settings, references, RUN_SEED + k, runs)
+            for settings, runs in zip(plan.transport, whole_runs, strict=True):
+                _measure_transport(bench, settings, references, RUN_SEED + k, runs)
         log(f"{name}: round {k + 1} of {plan.rounds}")
 
     resolution = references.resolution()
     rows = []
-    for heights in plan.maps:
-        for which in (MitsubaPart.integrator, MisPart.integrator):
-            rows += _sweep_rows(bench, which, heights, parts, part_runs)
-    rows += [
-        _transport_row(heights, settings, runs)
-        for (heights, settings), runs in zip(wholes, whole_runs, strict=True)
-    ]
-    for row in rows:
-        fg, shadow = row.pop("heights")
-        row["scene"], row["map"] = name, f"{fg}:{shadow}"
-        row["rmse_resolution"] = combined(resolution["foreground", fg], resolution["ratio", shadow])
-    return rows
+    for which in (MitsubaPart.integrator, MisPart.integrator):
+        rows += _sweep_rows(bench, which, parts, part_runs)
+    rows += [_transport_row(*pair) for pair in zip(plan.transport, whole_runs, strict=True)]
+    return [{**row, "scene": name, "rmse_resolution": resolution} for row in rows]
 
 
 def _measure_transport(
-    bench: Bench,
-    heights: tuple[int, int],
-    settings: dict[str, Any],
-    references: References,
-    seed: int,
-    runs: Runs,
+    bench: Bench, settings: dict[str, Any], references: References, seed: int, runs: Runs
 ) -> None:
     """Trace once and time several steps; the frozen samples have one error, whatever the step."""
     bench.memory.start()
-    transport = Transport(bench, heights, settings, seed)
+    transport = Transport(bench, settings, seed)
     runs.seconds_traced.append(transport.traced.seconds_traced)
     runs.bytes = transport.traced.bytes
     transport.warm()
     for k in range(TRANSPORT_STEPS):
         found = runs.time(transport, seed + k)
     runs.peak_mib = max(runs.peak_mib, bench.memory.stop())
-    runs.judge(found, references, dict(zip(PARTS, heights, strict=True)))
+    runs.judge(found, references)
     del transport, found
     gc.collect()
 
@@ -230,28 +204,19 @@ def _spread(seconds: Sequence[float]) -> float:
 
 
 def _sweep_rows(
-    bench: Bench,
-    which: str,
-    heights: tuple[int, int],
-    parts: Sequence[MisPart | MitsubaPart],
-    runs: Sequence[Runs],
+    bench: Bench, which: str, parts: Sequence[MisPart | MitsubaPart], runs: Sequence[Runs]
 ) -> list[dict[str, Any]]:
     """Join both parts at the same samples per pixel into rows."""
-    found = {
-        (c.part, c.spp): r
-        for c, r in zip(parts, runs, strict=True)
-        if c.integrator == which and c.height == heights[PARTS.index(c.part)]
-    }
+    pairs = zip(parts, runs, strict=True)
+    found = {(c.part, c.spp): r for c, r in pairs if c.integrator == which}
     rows = []
     for spp in sorted({spp for _, spp in found}):
-        if not all((part, spp) in found for part in PARTS):
-            continue
         by_part = {part: _part(found[part, spp], part) for part in PARTS}
         fg, ratio = by_part.values()
         settings: dict[str, Any] = {"spp": spp}
         if which == MitsubaPart.integrator:
             settings |= {"integrator": bench.mitsuba_integrator, "sampler": bench.sampler}
-        row = {"integrator": which, "settings": settings, "heights": heights}
+        row: dict[str, Any] = {"integrator": which, "settings": settings}
         row |= {key: fg[key] + ratio[key] for key in ("seconds_forward", "seconds_step")}
         row |= {key: combined(fg[key], ratio[key]) for key in ERRORS}
         # One after the other: the larger of the two
@@ -260,14 +225,11 @@ def _sweep_rows(
     return rows
 
 
-def _transport_row(
-    heights: tuple[int, int], settings: dict[str, Any], runs: Runs
-) -> dict[str, Any]:
+def _transport_row(settings: dict[str, Any], runs: Runs) -> dict[str, Any]:
     errors = {part: runs.errors(part) for part in PARTS}
     return {
         "integrator": "transport",
         "settings": settings,
-        "heights": heights,
         "seconds_forward": float(np.median(runs.seconds_forward)),
         "seconds_step": float(np.median(runs.seconds_step)),
         "seconds_step_spread": _spread(runs.seconds_step),
@@ -287,15 +249,14 @@ def disagreements(agreement: Sequence[dict[str, Any]], rows: Sequence[dict[str, 
     """
     found = []
     for entry in agreement:
-        scene, part, height = entry["scene"], entry["part"], entry["height"]
-        k = PARTS.index(part)
-        here = [r for r in rows if (r["scene"], int(r["map"].split(":")[k])) == (scene, height)]
+        scene, part = entry["scene"], entry["part"]
+        here = [r for r in rows if r["scene"] == scene]
         for quantity in ("image", "gradient"):
             least = min((r["parts"][part][f"rmse_{quantity}"] for r in here), default=np.inf)
             apart = entry[quantity]["without_noise"]
             if apart > max(0.1 * least, entry[quantity]["resolved"]):
                 found.append(
-                    f"{scene}, {part} {quantity}, map {height}: the references differ by "
+                    f"{scene}, {part} {quantity}: the references differ by "
                     f"{100 * apart:.3f} % beyond their noise; the smallest error compared is "
                     f"{100 * least:.3f} %"
                 )
@@ -311,33 +272,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--sampler", default="ldsampler", help="of Mitsuba")
     about = "let Mitsuba's Python trace every call anew"
     parser.add_argument("--no-freeze", action="store_true", help=about)
-    about = "of Mitsuba's reference, twice a power of 4"
-    parser.add_argument("--reference-spp", type=int, help=about)
-    parser.add_argument("--own-reference-spp", type=int, help="of mis's reference")
-    parser.add_argument(
-        "--maps", nargs="*", help="rows of the object's map and the shadow's: 32:32"
-    )
-    parser.add_argument("--rounds", type=int)
     parser.add_argument("--budget", type=float, help="seconds per candidate")
     parser.add_argument("--cache", type=Path, default=Path("out/speed"), help="of references")
     about = "write table and plot here (docs, unless --quick)"
     parser.add_argument("--docs", type=Path, help=about)
     return parser.parse_args(arguments)
-
-
-def plan_of(options: argparse.Namespace) -> Plan:
-    """Return the plan with what the options change in it."""
-    asked = {
-        "reference_spp": options.reference_spp,
-        "own_reference_spp": options.own_reference_spp,
-        "rounds": options.rounds,
-        "budget_s": options.budget,
-    }
-    if options.maps:
-        pairs = [tuple(int(h) for h in pair.split(":")) for pair in options.maps]
-        asked["maps"] = tuple((pair[0], pair[-1]) for pair in pairs)
-    plan = QUICK if options.quick else Plan()
-    return replace(plan, **{name: value for name, value in asked.items() if value})
 
 
 def measured(
@@ -346,13 +285,12 @@ def measured(
     """Return the rows of a scene, and how far its references agree."""
     import drjit as dr
 
-    bench = Bench(scene, plan.maps, options.sampler, not options.no_freeze)
-    spp = plan.reference_spp, plan.own_reference_spp
-    references = References(bench, *spp, options.cache, log)
+    bench = Bench(scene, options.sampler, not options.no_freeze)
+    references = References(bench, options.cache, log)
     rows = measure_scene(bench, plan, references)
     agreement = [
-        {"scene": scene.name, "part": part, "height": height, **reference.agreement()}
-        for (part, height), reference in references.by_map.items()
+        {"scene": scene.name, "part": part, **reference.agreement()}
+        for part, reference in references.by_part.items()
     ]
     del bench, references
     gc.collect()
@@ -363,7 +301,9 @@ def measured(
 def main(arguments: list[str] | None = None) -> None:
     """Measure, write the JSON and, after a full run, the documents."""
     options = parse(arguments)
-    plan = plan_of(options)
+    plan = QUICK if options.quick else Plan()
+    if options.budget:
+        plan = replace(plan, budget_s=options.budget)
     device = choose_device(options.device)
     threads = options.threads or core_count()
     use_device("cpu" if device == "cpu" else "cuda", threads)

@@ -8,7 +8,7 @@ image without a gradient in other ways than one with, so each has an error of it
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from benchmarks.speed.memory import PeakMemory
-from benchmarks.speed.scenes import SpeedScene
+from benchmarks.speed.scenes import MAP_HEIGHT, SpeedScene
 from warpir.core.arrays import Float64Array
 from warpir.render.integrator import Radiance
 from warpir.render.mis.integrator import MisIntegrator
@@ -35,37 +35,27 @@ Step = dict[str, tuple[Float64Array, Float64Array]]
 
 
 class Bench:
-    """One scene, its maps, and what all candidates share.
+    """One scene, its map, and what all candidates share.
 
-    ``maps`` are rows of the map for the foreground and for the shadow, by pair; ``freeze`` says
-    whether Mitsuba's functions are traced once.
+    ``freeze`` says whether Mitsuba's functions are traced once.
     """
 
-    def __init__(
-        self, scene: SpeedScene, maps: Sequence[tuple[int, int]], sampler: str, freeze: bool
-    ) -> None:
+    def __init__(self, scene: SpeedScene, sampler: str, freeze: bool) -> None:
         from benchmarks.speed.mitsuba import MitsubaScene
 
         self.scene, self.sampler = scene, sampler
         # Stock prb does not see ToyCar's emission texture, and takes twice gltf_path's time there
         self.mitsuba_integrator = "gltf_path" if scene.name == "toycar" else "prb"
-        self.heights = {
-            part: list(dict.fromkeys(pair[k] for pair in maps)) for k, part in enumerate(PARTS)
-        }
-        every = sorted({height for pair in maps for height in pair})
-        self.texels = {height: scene.texels(height) for height in every}
-        self.mitsuba = {
-            height: MitsubaScene(scene, texels, self.mitsuba_integrator, sampler, freeze)
-            for height, texels in self.texels.items()
-        }
+        self.texels = scene.texels()
+        self.mitsuba = MitsubaScene(scene, self.texels, self.mitsuba_integrator, sampler, freeze)
         self.memory = PeakMemory(scene.renderer.device)
         self.device = torch.device("cuda" if scene.renderer.device.is_cuda else "cpu")
         weights = zip(PARTS, (scene.weight_fg, scene.weight_ratio), strict=True)
         self.weights = {part: torch.tensor(w, device=self.device) for part, w in weights}
 
-    def leaf(self, height: int, grad: bool = True) -> Tensor:
-        """Upload a map as the optimiser holds it."""
-        return torch.tensor(self.texels[height], device=self.device, requires_grad=grad)
+    def leaf(self, grad: bool = True) -> Tensor:
+        """Upload the map as the optimiser holds it."""
+        return torch.tensor(self.texels, device=self.device, requires_grad=grad)
 
     def synchronize(self) -> None:
         """Wait for our side of the device."""
@@ -79,9 +69,9 @@ class MisPart:
 
     integrator = "mis"
 
-    def __init__(self, bench: Bench, part: str, height: int, spp: int) -> None:
+    def __init__(self, bench: Bench, part: str, spp: int) -> None:
         scene = bench.scene
-        self.bench, self.part, self.height, self.spp = bench, part, height, spp
+        self.bench, self.part, self.spp = bench, part, spp
         self.warm_key = (self.integrator, part)
         self.mis = MisIntegrator(
             scene.renderer, scene.object_pixels, scene.receiver_pixels, spp, 1, scene.depth
@@ -95,11 +85,11 @@ class MisPart:
 
     def warm(self) -> None:
         """Compile."""
-        MisPart(self.bench, self.part, self.height, 1).step(WARM_SEED)
+        MisPart(self.bench, self.part, 1).step(WARM_SEED)
 
     def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
-        light = self.bench.leaf(self.height, grad=False)
+        light = self.bench.leaf(grad=False)
         with torch.no_grad():
             image = self._image(self.mis.radiance(light, light, seed))
         self.bench.synchronize()
@@ -107,7 +97,7 @@ class MisPart:
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""
-        leaf = self.bench.leaf(self.height)
+        leaf = self.bench.leaf()
         image = self._image(self.mis.radiance(leaf, leaf, seed))
         (image * self.bench.weights[self.part]).sum().backward()  # type: ignore[no-untyped-call]
         self.bench.synchronize()
@@ -122,15 +112,15 @@ class MitsubaPart:
 
     integrator = "mitsuba"
 
-    def __init__(self, bench: Bench, part: str, height: int, spp: int) -> None:
-        self.bench, self.part, self.height, self.spp = bench, part, height, spp
-        self.target = bench.mitsuba[height]
+    def __init__(self, bench: Bench, part: str, spp: int) -> None:
+        self.bench, self.part, self.spp = bench, part, spp
+        self.target = bench.mitsuba
         self.pass_spp = self.target.largest_pass(part, spp)
-        self.warm_key = (self.integrator, part, height, self.pass_spp)
+        self.warm_key = (self.integrator, part, self.pass_spp)
 
     def warm(self) -> None:
         """Compile and record, with the samples of one pass; a scene's first call records twice."""
-        one = MitsubaPart(self.bench, self.part, self.height, self.pass_spp)
+        one = MitsubaPart(self.bench, self.part, self.pass_spp)
         for seed in range(WARM_SEED, WARM_SEED + (2 if self.pass_spp < 100 else 1)):
             one.forward(seed)
             one.step(seed)
@@ -162,18 +152,12 @@ class MitsubaPart:
 class Transport:
     """`transport` on both parts, traced when made.
 
-    ``heights`` are rows of the map for the foreground and for the shadow; ``settings`` are fields
-    of ``TransportSettings``, and ``expects_light``: whether tracing puts directions where this
-    scene's light is, or evenly everywhere.
+    ``settings`` are fields of ``TransportSettings``, and ``expects_light``: whether tracing puts
+    directions where this scene's light is, or evenly everywhere.
     """
 
-    integrator = "transport"
-
-    def __init__(
-        self, bench: Bench, heights: tuple[int, int], settings: dict[str, Any], seed: int
-    ) -> None:
-        self.bench, self.heights = bench, heights
-        self.warm_key = (self.integrator,)
+    def __init__(self, bench: Bench, settings: dict[str, Any], seed: int) -> None:
+        self.bench = bench
         fields = {k: v for k, v in settings.items() if k != "expects_light"}
         scene = bench.scene
         self.traced = TransportIntegrator(
@@ -181,7 +165,7 @@ class Transport:
             scene.object_pixels,
             scene.receiver_pixels,
             depth=scene.depth,
-            settings=TransportSettings(height_fg=heights[0], height_shadow=heights[1], **fields),
+            settings=TransportSettings(height_fg=MAP_HEIGHT, height_shadow=MAP_HEIGHT, **fields),
             expected=Light(scene.lobes) if settings.get("expects_light", True) else None,
             seed=seed,
         )
@@ -194,15 +178,15 @@ class Transport:
     def forward(self, seed: int) -> Callable[[], Images]:
         """Render."""
         with torch.no_grad():
-            lights = (self.bench.leaf(h, grad=False) for h in self.heights)
-            out = self.traced.radiance(*lights, seed)
+            light = self.bench.leaf(grad=False)
+            out = self.traced.radiance(light, light, seed)
             images = (out.foreground, shadow_ratio(out))
         self.bench.synchronize()
         return lambda: dict(zip(PARTS, map(numpy, images), strict=True))
 
     def step(self, seed: int) -> Callable[[], Step]:
         """Render and differentiate."""
-        leaves = [self.bench.leaf(height) for height in self.heights]
+        leaves = [self.bench.leaf() for _ in PARTS]
         out = self.traced.radiance(*leaves, seed)
         images = (out.foreground, shadow_ratio(out))
         weights = self.bench.weights

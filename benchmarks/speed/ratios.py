@@ -82,20 +82,17 @@ def best_split(foreground: Curve, ratio: Curve, error: float) -> Time:
 
 
 def curves(rows: Sequence[dict[str, Any]], seconds: str, rmse: str) -> tuple[Curve, Curve]:
-    """Return foreground's and ratio's curve of one renderer's sweep, by the names of its fields.
-
-    Runs of before 2026-11-25 have no ``rmse_forward``, and sampled that image as the step's.
-    """
+    """Return foreground's and ratio's curve of one renderer's sweep, by the names of its fields."""
 
     def curve(name: str) -> Curve:
         parts = [row["parts"][name] for row in rows]
-        return Curve([p[seconds] for p in parts], [p.get(rmse, p["rmse_image"]) for p in parts])
+        return Curve([p[seconds] for p in parts], [p[rmse] for p in parts])
 
     return curve("foreground"), curve("ratio")
 
 
 def transport_ratio(row: dict[str, Any], theirs: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compare one transport row with another renderer's sweep on the same scene and map.
+    """Compare one transport row with another renderer's sweep on the same scene.
 
     The other's time is the smaller of the two at which it reaches transport's error of the image
     and of the gradient, so transport has an equal or lower error of both.
@@ -114,8 +111,6 @@ def transport_ratio(row: dict[str, Any], theirs: Sequence[dict[str, Any]]) -> di
         "at_least": other.at_least,
         "seconds_step": step,
         "seconds_traced": traced,
-        "rmse_image": row["rmse_image"],
-        "rmse_gradient": row["rmse_gradient"],
         "mitsuba_seconds_step_by_image": by_image.seconds,
         "mitsuba_at_least_by_image": by_image.at_least,
         "mitsuba_seconds_step_by_gradient": by_gradient.seconds,
@@ -141,37 +136,22 @@ def mis_ratio(
         found[name] = {
             "ratio": t_other.seconds / t_own.seconds,
             "rmse": error,
-            "mis_seconds": t_own.seconds,
-            "mitsuba_seconds": t_other.seconds,
         }
     return found
 
 
 def ratios(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one record per scene and map: ``mis``, and one entry of ``transport`` per setting.
-
-    ``step`` and ``run_600`` are those of the first setting, the defaults.
-    """
-    keys = list(dict.fromkeys((r["scene"], r["map"]) for r in rows))
+    """Return one record per scene: ``mis``, and one entry of ``transport`` per setting."""
     records = []
-    for scene, size in keys:
-        here = [r for r in rows if (r["scene"], r["map"]) == (scene, size)]
-        by = {
-            name: [r for r in here if r["integrator"] == name]
+    for scene in dict.fromkeys(r["scene"] for r in rows):
+        mis, theirs, traced = (
+            [r for r in rows if (r["scene"], r["integrator"]) == (scene, name)]
             for name in ("mis", "mitsuba", "transport")
-        }
-        if not by["mitsuba"]:
-            continue
-        record: dict[str, Any] = {"scene": scene, "map": size, "mis": None, "transport": []}
-        if by["mis"]:
-            record["mis"] = mis_ratio(by["mis"], by["mitsuba"])
-        for row in by["transport"]:
-            record["transport"].append(
-                {"settings": row["settings"], **transport_ratio(row, by["mitsuba"])}
-            )
-        for name in ("step", "run_600", "at_least"):
-            record[name] = record["transport"][0][name] if record["transport"] else None
-        records.append(record)
+        )
+        transport = [
+            {"settings": row["settings"], **transport_ratio(row, theirs)} for row in traced
+        ]
+        records.append({"scene": scene, "mis": mis_ratio(mis, theirs), "transport": transport})
     return records
 
 

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.candidates import PARTS, Bench, MisPart, MitsubaPart, numpy
-from benchmarks.speed.ratios import rmse
+from benchmarks.speed.ratios import combined, rmse
+from benchmarks.speed.scenes import MAP_HEIGHT
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.render.device_light import light_args
 from warpir.scene.light import Light
@@ -28,6 +29,8 @@ with them is stated beside."""
 PILOT_RUNS, PILOT_SPP = 32, 16
 """Runs that tell which pixels these are. The references' own halves may not: where they happen to
 agree, their products are no longer free of noise."""
+OWN_SPP, MITSUBA_SPP = 512, 2048
+"""Camera samples per pixel; Mitsuba's are twice a power of 4."""
 SEED = 10_000
 CHUNK = 64
 """Samples per pixel of one run of `mis`."""
@@ -35,7 +38,7 @@ CHUNK = 64
 
 @dataclass(frozen=True)
 class Reference:
-    """One part under one map."""
+    """One part."""
 
     own: tuple[Float64Array, Float64Array]
     """Our image, shape [2, pixel, 3], and gradient, shape [2, He, We, 3]."""
@@ -88,65 +91,54 @@ class Reference:
 class References:
     """Makes references of one scene, or reads them from the folder of the cache.
 
-    Under the main map Mitsuba takes ``spp`` samples per pixel and `mis` ``own_spp``, a quarter
-    under the others. ``log`` is told what was made.
+    ``log`` is told what was made.
     """
 
-    def __init__(
-        self, bench: Bench, spp: int, own_spp: int, cache: Path, log: Callable[[str], None]
-    ) -> None:
+    def __init__(self, bench: Bench, cache: Path, log: Callable[[str], None]) -> None:
         self.bench, self.cache, self.log = bench, cache, log
-        self.spp = {"own": own_spp, "mitsuba": spp}
-        self.by_map: dict[tuple[str, int], Reference] = {}
-        for part in PARTS:
-            self.kept = self._quiet(part)
-            for k, height in enumerate(bench.heights[part]):
-                self.by_map[part, height] = self._converge(part, height, 1 if k == 0 else 4)
+        self.by_part = {part: self._converge(part) for part in PARTS}
 
-    def _converge(self, part: str, height: int, share: int) -> Reference:
-        pixels = len(self.bench.weights[part])
+    def _converge(self, part: str) -> Reference:
+        kept, pixels = self._quiet(part), len(self.bench.weights[part])
         made = []
-        for name, make in (("own", _own), ("mitsuba", _mitsuba)):
-            spp = self.spp[name] // share
+        for name, make, spp in (("own", _own, OWN_SPP), ("mitsuba", _mitsuba, MITSUBA_SPP)):
             flat = self._cached(
-                f"{name}, {part}, map {height}, {spp} samples",
-                {"renderer": name, "part": part, "spp": spp, "map": self._hash(part, height)},
-                lambda make=make, spp=spp: make(self.bench, part, height, spp),
+                f"{name}, {part}, {spp} samples",
+                {"renderer": name, "part": part, "spp": spp, "map": self._hash(part)},
+                lambda make=make, spp=spp: make(self.bench, part, spp),
             )
             image, gradient = np.split(flat, [3 * pixels], axis=1)
-            made.append((image.reshape(2, -1, 3), gradient.reshape(2, height, 2 * height, 3)))
-        return Reference(made[0], made[1], self.kept)
+            shape = (2, MAP_HEIGHT, 2 * MAP_HEIGHT, 3)
+            made.append((image.reshape(2, -1, 3), gradient.reshape(shape)))
+        return Reference(made[0], made[1], kept)
 
     def _quiet(self, part: str) -> BoolArray:
         """Return which pixels are not among the noisiest, shape [pixel]."""
-        height = self.bench.heights[part][0]
 
         def variance() -> Float64Array:  # of `mis` over seeds, summed over channels
-            run = MisPart(self.bench, part, height, PILOT_SPP)
+            run = MisPart(self.bench, part, PILOT_SPP)
             images = [run.forward(SEED // 2 + k)()[part] for k in range(PILOT_RUNS)]
             return np.asarray(np.stack(images).var(axis=0).sum(axis=-1))
 
-        key = {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part, height)}
+        key = {"pilot": [PILOT_RUNS, PILOT_SPP], "part": part, "map": self._hash(part)}
         return quiet(self._cached(f"noise, {part}", key, variance))
 
-    def resolution(self) -> dict[tuple[str, int], float]:
-        """Relative RMSE between images under the map and under the lobes it was made of."""
-        found = {}
-        for part in PARTS:
-            spp = self.spp["own"]
+    def resolution(self) -> float:
+        """Relative RMSE between the image under the map and under the lobes it was made of."""
+        found = []
+        for part, reference in self.by_part.items():
+            key = {"renderer": "own", "part": part, "spp": OWN_SPP}
             exact = self._cached(
-                f"own, {part}, lobes, {spp} samples",
-                {"renderer": "own", "part": part, "spp": spp, "map": self._hash(part, 0)},
-                lambda part=part, spp=spp: _own_lobes(self.bench, part, spp),
+                f"own, {part}, lobes, {OWN_SPP} samples",
+                {**key, "map": self._hash(part, of_lobes=True)},
+                lambda part=part: _own_lobes(self.bench, part, OWN_SPP),
             ).reshape(2, -1, 3)
-            for height in self.bench.heights[part]:
-                reference = self.by_map[part, height]
-                images = (k[0].mean(axis=0) for k in (reference.own, reference.mitsuba))
-                own, other, *lobes = (image[reference.kept] for image in (*images, *exact))
-                apart = float(((own - lobes[0]) * (other - lobes[1])).mean())
-                size = float((lobes[0] * lobes[1]).mean())
-                found[part, height] = float(np.sqrt(max(apart, 0.0) / size))
-        return found
+            images = (k[0].mean(axis=0) for k in (reference.own, reference.mitsuba))
+            own, other, *lobes = (image[reference.kept] for image in (*images, *exact))
+            apart = float(((own - lobes[0]) * (other - lobes[1])).mean())
+            size = float((lobes[0] * lobes[1]).mean())
+            found.append(float(np.sqrt(max(apart, 0.0) / size)))
+        return combined(*found)
 
     def _cached(
         self, what: str, key: dict[str, Any], make: Callable[[], Float64Array]
@@ -162,10 +154,10 @@ class References:
         self.log(f"{self.bench.scene.name}: reference of {what}")
         return made
 
-    def _hash(self, part: str, height: int) -> str:
-        """Digest of all that a reference depends on but its samples; height 0: the lobes."""
+    def _hash(self, part: str, of_lobes: bool = False) -> str:
+        """Digest of all that a reference depends on but its samples."""
         scene = self.bench.scene
-        light = [self.bench.texels[height]] if height else list(astuple(scene.lobes))
+        light = list(astuple(scene.lobes)) if of_lobes else [self.bench.texels]
         settings: tuple[Any, ...] = (scene.camera.width, scene.camera.fx)
         if part == "foreground":
             arrays = [scene.object_pixels, scene.weight_fg]
@@ -202,10 +194,10 @@ def _seeds(first: int, count: int) -> list[list[int]]:
     return [[SEED * (half + first) + k for k in range(count)] for half in range(2)]
 
 
-def _own(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
+def _own(bench: Bench, part: str, spp: int) -> Float64Array:
     """Converge `mis`: two halves of image and gradient, shape [2, image + gradient]."""
     chunk = min(CHUNK, spp // 2)
-    run = MisPart(bench, part, height, chunk)
+    run = MisPart(bench, part, chunk)
     halves = []
     for seeds in _seeds(1, spp // 2 // chunk):
         if part == "foreground":
@@ -220,16 +212,16 @@ def _own(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
 def _own_ratio(run: MisPart, seeds: list[int]) -> tuple[Float64Array, Float64Array]:
     """Divide means over many runs, so that the quotient's bias falls with all their samples."""
     bench = run.bench
-    light = bench.leaf(run.height, grad=False)
+    light = bench.leaf(grad=False)
     lit, unoccluded = _plane_sums(run, light, seeds)
     seen = unoccluded > 0.0
     inverse = torch.where(seen, 1.0 / torch.where(seen, unoccluded, 1.0), 0.0)
     ratio = torch.where(seen, lit * inverse, 1.0)
     d_lit = bench.weights["ratio"] * inverse
     d_unoccluded = -d_lit * ratio
-    total = np.zeros(bench.texels[run.height].shape)
+    total = np.zeros(bench.texels.shape)
     for seed in seeds:
-        leaf = bench.leaf(run.height)
+        leaf = bench.leaf()
         # Seeds of their own: the adjoint must share no noise with what it multiplies
         out = run.mis.radiance(leaf, leaf, seed + 500_000)
         torch.autograd.backward([out.lit, out.unoccluded], [d_lit.float(), d_unoccluded.float()])
@@ -251,7 +243,7 @@ def _plane_sums(run: MisPart, light: Tensor, seeds: list[int]) -> tuple[Tensor, 
 def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
     """Converge `mis` under the lobes themselves: two halves of the image, shape [2, image]."""
     chunk = min(CHUNK, spp // 2)
-    run = MisPart(bench, part, bench.heights[part][0], chunk)
+    run = MisPart(bench, part, chunk)
     scene, renderer = bench.scene, bench.scene.renderer
     light = light_args(Light(scene.lobes), renderer.device)
     halves = []
@@ -273,16 +265,16 @@ def _own_lobes(bench: Bench, part: str, spp: int) -> Float64Array:
     return np.stack(halves)
 
 
-def _mitsuba(bench: Bench, part: str, height: int, spp: int) -> Float64Array:
+def _mitsuba(bench: Bench, part: str, spp: int) -> Float64Array:
     """Converge Mitsuba; see `_own`."""
     from benchmarks.speed.mitsuba import ratio_adjoint
 
-    target = bench.mitsuba[height]
+    target = bench.mitsuba
     halves = []
     for half in range(2):
         seed = SEED * (half + 3)
         if part == "foreground":
-            image, gradient = MitsubaPart(bench, part, height, spp // 2).step(seed)()[part]
+            image, gradient = MitsubaPart(bench, part, spp // 2).step(seed)()[part]
         else:
             sums = target.plane(spp // 2, seed)
             d_lit, d_unoccluded, ratio = ratio_adjoint(*sums, target.weight_ratio)

@@ -61,7 +61,7 @@ few noisy pixels, whose rays are long besides: below 2^26 samples it takes as ma
 The ratios say how many times longer Mitsuba takes when its error has come down to ours, in image or
 in gradient, whichever it reaches sooner. It may split its samples between object and plane as suits
 it best. `>=`: its longest run has not come down that far. `600 steps` includes tracing `transport`.
-A map `32:64` has 32 rows for the object and 64 for the shadow."""
+The map has 32 rows."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -93,7 +93,7 @@ def times(value: float | None, at_least: bool) -> str:
 
 def transport_table(result: dict[str, Any]) -> str:
     """Write the ratios of `transport`."""
-    head = ("scene", "map", "transport", "tracing", "step")
+    head = ("scene", "transport", "tracing", "step")
     head += ("Mitsuba's step at equal image / gradient", "**step**", "**600 steps**", "level after")
 
     def seconds(entry: dict[str, Any], name: str) -> str:
@@ -103,7 +103,7 @@ def transport_table(result: dict[str, Any]) -> str:
     def cells(record: dict[str, Any], entry: dict[str, Any]) -> tuple[str, ...]:
         level = entry["break_even_steps"]
         return (
-            *(record["scene"], record["map"], settings_text(entry["settings"])),
+            *(record["scene"], settings_text(entry["settings"])),
             f"{number(entry['seconds_traced'])} s",
             f"{number(1000.0 * entry['seconds_step'])} ms",
             f"{seconds(entry, 'image')} / {seconds(entry, 'gradient')}",
@@ -123,16 +123,15 @@ def mis_table(result: dict[str, Any]) -> str:
 
     names = ("forward_image", "step_image", "step_gradient")
     rows = (
-        (record["scene"], record["map"], *(cell(record["mis"][name]) for name in names))
+        (record["scene"], *(cell(record["mis"][name]) for name in names))
         for record in result["ratios"]
-        if record["mis"]
     )
-    return table(("scene", "map", "forward, image", "step, image", "step, gradient"), rows)
+    return table(("scene", "forward, image", "step, image", "step, gradient"), rows)
 
 
 def row_table(result: dict[str, Any]) -> str:
     """Write what was measured."""
-    head = ("scene", "map", "integrator", "settings", "tracing", "forward", "its image", "step")
+    head = ("scene", "integrator", "settings", "tracing", "forward", "its image", "step")
     head += ("image", "all", "gradient", "object / ratio", "gradient of object / ratio", "MiB")
 
     def pair(row: dict[str, Any], name: str) -> str:
@@ -141,10 +140,10 @@ def row_table(result: dict[str, Any]) -> str:
     def cells(row: dict[str, Any]) -> tuple[str, ...]:
         traced = row.get("seconds_traced")
         return (
-            *(row["scene"], row["map"], row["integrator"], settings_text(row["settings"])),
+            *(row["scene"], row["integrator"], settings_text(row["settings"])),
             "" if traced is None else f"{number(traced)} s",
             f"{number(1000.0 * row['seconds_forward'])} ms",
-            percent(row.get("rmse_forward", row["rmse_image"])),
+            percent(row["rmse_forward"]),
             f"{number(1000.0 * row['seconds_step'])} ms",
             *(percent(row[f"rmse_{name}"]) for name in ("image", "image_all", "gradient")),
             *(pair(row, name) for name in ("rmse_image", "rmse_gradient")),
@@ -170,8 +169,8 @@ def summary(result: dict[str, Any]) -> str:
 def device_text(result: dict[str, Any]) -> str:
     """Return one device's chapter."""
     c = result["conditions"]
-    resolution = {(r["scene"], r["map"]): r["rmse_resolution"] for r in result["rows"]}
-    costs = ", ".join(f"{scene} {size} {percent(e)}" for (scene, size), e in resolution.items())
+    resolution = {r["scene"]: r["rmse_resolution"] for r in result["rows"]}
+    costs = ", ".join(f"{scene} {percent(e)}" for scene, e in resolution.items())
     threads = f", {c['threads']} threads" if c["threads"] else ""
     pixels = "; ".join(
         f"{s['name']}: {s['triangles']} triangles, D = {s['depth']}, {s['object_pixels']} object "
@@ -248,7 +247,7 @@ def plot(results: Sequence[dict[str, Any]], path: Path) -> None:
         for q, (key, label) in enumerate(quantities):
             for s, scene in enumerate(scenes):
                 axis = axes[s][2 * d + q]
-                _panel(axis, _main_rows(result, scene), key)
+                _panel(axis, [r for r in result["rows"] if r["scene"] == scene], key)
                 axis.set_title(f"{scene}, {label}\n{result['conditions']['device']}", fontsize=9)
                 if s == len(scenes) - 1:
                     axis.set_xlabel("time of one step [s]")
@@ -266,12 +265,6 @@ def plot(results: Sequence[dict[str, Any]], path: Path) -> None:
     with Image.open(path) as image:
         few = image.convert("RGB").quantize(64)
     few.save(path, optimize=True)
-
-
-def _main_rows(result: dict[str, Any], scene: str) -> list[dict[str, Any]]:
-    """Return a scene's rows under the main map, the first that was measured."""
-    here = [r for r in result["rows"] if r["scene"] == scene]
-    return [r for r in here if r["map"] == here[0]["map"]]
 
 
 def _panel(axis: Any, rows: list[dict[str, Any]], key: str) -> None:

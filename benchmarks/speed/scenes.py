@@ -38,6 +38,8 @@ the ball does."""
 TOYCAR = "mesh/ToyCar.glb"
 PANORAMA = "hdri/modern_buildings_2_1k.hdr"
 PANORAMA_HEIGHT = 256
+MAP_HEIGHT = 32
+"""Rows of the light's map."""
 PANORAMA_TURN = -90.0
 """About +Y [deg]."""
 SHARPNESS_MAX = 2000.0
@@ -80,9 +82,9 @@ class SpeedScene:
             "receiver_pixels": len(self.receiver_pixels),
         }
 
-    def texels(self, height: int) -> FloatArray:
-        """Return the light as a map, relative [W/(m^2 sr)], shape [height, 2 height, 3]."""
-        return rasterize_lobes(self.lobes, height, 2 * height)
+    def texels(self) -> FloatArray:
+        """Return the light as a map, relative [W/(m^2 sr)], shape [He, We, 3]."""
+        return rasterize_lobes(self.lobes, MAP_HEIGHT, 2 * MAP_HEIGHT)
 
 
 def standing_ball(rings: int = 128) -> Primitive:
