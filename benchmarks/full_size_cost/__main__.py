@@ -1,12 +1,12 @@
 """What does a guided run cost, in time and memory, with a model of Stable Diffusion 2.1's size?
 
-    python -m benchmarks.full_size_cost [--quick | --tiny] --json FILE
+    python -m benchmarks.full_size_cost [--tiny] --json FILE
 
 The whole program runs on the scene that ships with it: class images, LoRA, light transport, 600
 steps, final render. The model has the shapes of Stable Diffusion 2.1-base and random weights, which
-cost what trained ones do; what the run recovers means nothing. ``--quick`` takes a tenth of the
-steps, ``--tiny`` also a tiny model, within seconds on the CPU. The same program with a tiny model
-runs first, so that no compilation is measured.
+cost what trained ones do; what the run recovers means nothing. ``--tiny`` takes few steps with a
+tiny model, within seconds on the CPU. Without it that runs first, so that no compilation is
+measured.
 """
 
 import gc
@@ -44,7 +44,6 @@ AUTHORS = InsertConfig(
     report=False,
 )  # fmt: skip
 """What the authors' run does; neither detail, files for other tools nor a report are theirs."""
-QUICK = AUTHORS.changed(class_images=16, lora_steps=100, steps=60)
 TINY = AUTHORS.changed(
  class_images=2, class_steps=2, lora_steps=4, steps=8, guidance_width=32, lobes=8,
     light_height=16, object_light_height=8, score_every=4, width=48, samples=2,
@@ -74,8 +73,7 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
     recording = prior.graphs.seconds if prior.graphs else 0.0
     steps = measure_steps(watch, config)
     word = "graphs" if "graphs" in steps["light"] else "eager"
-    split = steps["light_split"][word]
-    share = (split["render_forward"] + split["render_backward"]) / steps["light"][word]
+    share = steps["rendering"][word] / steps["light"][word]
     peak = max(memory.by_stage.values())
     found = {"whole_run_s": total, "peak_gb": peak, "rendering_share": share}
     return {
@@ -83,18 +81,10 @@ def measure(config: InsertConfig, model: Path, room: Path, device: wp.Device) ->
         "seconds": {name: round(spent, 3) for name, spent in stages.items()},
         "seconds_recording_graphs": round(recording, 3),
         "whole_run_s": total,
-        "per_step_ms": {
-            "class_image": 1e3 * stages["class images"] / max(config.adapter.class_images or 1, 1),
-            "lora": 1e3 * stages["training"] / max(config.adapter.lora_steps, 1),
-            "light": 1e3 * stages["optimize"] / max(config.optimize.step_count, 1),
-        },
         "step_ms": steps,
         "rendering_share": share,
         "peak_gb": peak,
         "peak_gb_by_stage": {k: round(v, 3) for k, v in memory.by_stage.items()},
-        "peak_gb_allocated": memory.allocated,
-        "notices": record["notices"],
-        "retraced": loop.retraced,
         "targets": {
             name: {"limit": limit, "found": found[name], "met": found[name] <= limit}
             for name, limit in TARGETS.items()
@@ -152,13 +142,11 @@ def _what_ran(
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the figures."""
     parser = flags(__doc__, "device", "json")
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="a tenth of the steps")
-    size.add_argument("--tiny", action="store_true", help="a tiny model, within seconds")
+    parser.add_argument("--tiny", action="store_true", help="a tiny model, within seconds")
     about = "setting=value, such as noises=4"
     parser.add_argument("--set", action="append", default=[], help=about)
     options = parser.parse_args(argv)
-    config = TINY if options.tiny else QUICK if options.quick else AUTHORS
+    config = TINY if options.tiny else AUTHORS
     for text in options.set:
         name, _, value = text.partition("=")
         config = config.changed(**{name: json.loads(value)})
@@ -167,23 +155,18 @@ def main(argv: list[str] | None = None) -> None:
         torch.set_num_threads(1)  # more only wait for each other in a network this small
     with tempfile.TemporaryDirectory() as folder:
         room = Path(folder)
-        start = time.perf_counter()
         model = room / "tiny"
         make_tiny_stable_diffusion(model)
         if not options.tiny:
             measure(TINY.changed(width=None), model, room / "warm", device)
-        warmed = time.perf_counter()
-        if not options.tiny:
             model = room / "model"
             write_model(model, torch.device(wp.device_to_torch(device)))
-        written = time.perf_counter()
         figures = measure(config, model, room / "run", device)
     arguments = sys.argv[1:] if argv is None else argv
     line = {
         **context(device, os.cpu_count() or 1),
         "command": shlex.join(["python", "-m", "benchmarks.full_size_cost", *arguments]),
         "versions": versions(),
-        "seconds_before": {"warm_up": warmed - start, "write_model": written - warmed},
         **figures,
     }
     print(json.dumps(line, indent=1))

@@ -1,4 +1,4 @@
-"""Time of single steps of LoRA and loop, and of the parts of one."""
+"""Time of single steps of LoRA and loop, and of the rendering in one."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
-from unittest import mock
 
 import torch
 
@@ -20,59 +19,6 @@ from warpir.optimize.light import LightOptimization
 
 WARM_STEPS, TIMED_STEPS = 8, 12
 """Steps before and within a measurement of single steps."""
-
-
-class Stopwatch:
-    """Adds up what some methods take, the device's work included."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.seconds: dict[str, float] = {}
-        self._starts: dict[str, float] = {}
-
-    def now(self) -> float:
-        """Return the time when the device is idle [s]."""
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return time.perf_counter()
-
-    def start(self, name: str) -> None:
-        """Start a part."""
-        self._starts[name] = self.now()
-
-    def stop(self, name: str) -> None:
-        """End a part."""
-        spent = self.now() - self._starts.pop(name)
-        self.seconds[name] = self.seconds.get(name, 0.0) + spent
-
-    @contextmanager
-    def around(self, owner: Any, method: str, name: str) -> Iterator[None]:
-        """Within this context every call of an object's method is timed."""
-        plain = getattr(owner, method)
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            self.start(name)
-            result = plain(*args, **kwargs)
-            self.stop(name)
-            return result
-
-        with mock.patch.object(owner, method, timed):
-            yield
-
-    @contextmanager
-    def around_gradient(self, owner: Any, method: str, name: str) -> Iterator[None]:
-        """Within this context the backward pass of a method of one tensor is timed."""
-        plain = getattr(owner, method)
-
-        def timed(x: torch.Tensor) -> Any:
-            result = plain(x)
-            if result.requires_grad:
-                result.register_hook(lambda _: self.start(name))
-                x.register_hook(lambda _: self.stop(name))
-            return result
-
-        with mock.patch.object(owner, method, timed):
-            yield
 
 
 @contextmanager
@@ -110,11 +56,16 @@ def lora_step_ms(prior: StableDiffusion, config: InsertConfig) -> float:
 
 def mean_ms(device: torch.device, steps: Callable[[int], None]) -> float:
     """Return the mean time of a step, after some that are not counted [ms]."""
-    watch = Stopwatch(device)
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
     steps(WARM_STEPS)
-    start = watch.now()
+    start = now()
     steps(TIMED_STEPS)
-    return 1e3 * (watch.now() - start) / TIMED_STEPS
+    return 1e3 * (now() - start) / TIMED_STEPS
 
 
 def light_steps(loop: LightOptimization, count: int) -> None:
@@ -127,50 +78,23 @@ def light_steps(loop: LightOptimization, count: int) -> None:
         loop.step()
 
 
-def light_step_split(loop: LightOptimization, prior: StableDiffusion) -> dict[str, float]:
-    """Return the parts of an optimisation step, each measured between two waits [ms]."""
-    watch = Stopwatch(prior.device)
-    with (
-        watch.around_gradient(prior, "encode", "vae_backward"),
-        watch.around(prior, "encode", "vae_forward"),
-        watch.around(prior, "predict", "unet"),
-        watch.around(loop.guide, "gradient", "guidance"),
-        watch.around(loop, "composite", "render_forward"),
-        watch.around(loop, "step", "step"),
-    ):
-        light_steps(loop, WARM_STEPS)
-        watch.seconds.clear()
-        light_steps(loop, TIMED_STEPS)
-    step = loop.settings.step_count // 2 + 1
-    for k in range(WARM_STEPS + TIMED_STEPS):
-        image = loop.composite(step).image
-        if k >= WARM_STEPS:
-            watch.start("render_backward")
+def renderings(loop: LightOptimization, count: int) -> None:
+    """Make the picture of such steps, forward and backward."""
+    for _ in range(count):
+        image = loop.composite(loop.settings.step_count // 2 + 1).image
         torch.autograd.backward([image], [torch.ones_like(image)])
-        if k >= WARM_STEPS:
-            watch.stop("render_backward")
-    ms = {name: 1e3 * spent / TIMED_STEPS for name, spent in watch.seconds.items()}
-    guidance, whole = ms.pop("guidance"), ms.pop("step")
-    rendering = ms["render_forward"] + ms["render_backward"]
-    model = ms["vae_forward"] + ms["vae_backward"] + ms["unet"]
-    return {
-        **ms,
-        "crop_and_residual": guidance - model,
-        "regularisers_and_optimiser": whole - guidance - rendering,
-        "sum": whole,
-    }
 
 
 def measure_steps(watch: Watch, config: InsertConfig) -> dict[str, Any]:
     """Return the times of single steps, as they are and replayed."""
     prior, loop = watch.made["prior"], watch.made["loop"]
-    found: dict[str, Any] = {"lora": {}, "light": {}, "light_split": {}}
+    found: dict[str, Any] = {"lora": {}, "light": {}, "rendering": {}}
     for word, wanted in (("eager", False), ("graphs", True)):
         if wanted and prior.graphs is None:
             continue
         with with_graphs(prior, loop, wanted):
             found["light"][word] = mean_ms(prior.device, partial(light_steps, loop))
-            found["light_split"][word] = light_step_split(loop, prior)
+            found["rendering"][word] = mean_ms(prior.device, partial(renderings, loop))
         with with_graphs(prior, loop, wanted):
             found["lora"][word] = lora_step_ms(prior, config)
     return found

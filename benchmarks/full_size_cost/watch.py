@@ -22,15 +22,12 @@ class Memory:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.by_stage: dict[str, float] = {}
-        self.allocated = 0.0
-        """Greatest memory that torch had given out, of what it had reserved [GB]."""
 
     def mark(self, stage: str) -> None:
         """Count what was used since the last mark as a stage's."""
         if self.device.is_cuda:
             # Warp's mark cannot be set back; its share is small.
             used = torch.cuda.max_memory_reserved() + wp.get_mempool_used_mem_high(self.device)
-            self.allocated = max(self.allocated, torch.cuda.max_memory_allocated() / 1e9)
             torch.cuda.reset_peak_memory_stats()
             peak = used / 1e9
         else:

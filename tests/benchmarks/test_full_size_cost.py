@@ -10,7 +10,6 @@ import torch
 
 from benchmarks.full_size_cost.__main__ import EXTRA_STAGES, TARGETS, main
 from benchmarks.full_size_cost.model import full_size_parts
-from benchmarks.full_size_cost.steps import Stopwatch
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -53,14 +52,9 @@ def test_stages_are_those_of_the_program_and_sum_up(figures: dict[str, Any]) -> 
 
 
 @pytest.mark.slow
-def test_parts_of_a_step_sum_up(figures: dict[str, Any]) -> None:
-    split = dict(figures["step_ms"]["light_split"]["eager"])
-    whole = split.pop("sum")
-    assert sum(split.values()) == pytest.approx(whole, rel=1e-6)
-    for name in ("vae_forward", "vae_backward", "unet", "render_forward", "render_backward"):
-        assert 0.0 < split[name] < whole
-    rendering = split["render_forward"] + split["render_backward"]
-    light = figures["step_ms"]["light"]["eager"]
+def test_rendering_is_a_part_of_a_step(figures: dict[str, Any]) -> None:
+    rendering, light = (figures["step_ms"][name]["eager"] for name in ("rendering", "light"))
+    assert 0.0 < rendering < light
     assert figures["rendering_share"] == pytest.approx(rendering / light, rel=1e-6)
     assert figures["step_ms"]["lora"]["eager"] > 0.0
 
@@ -99,22 +93,3 @@ def test_published_figures_are_this_programs(figures: dict[str, Any]) -> None:
     )
     assert {name: t["limit"] for name, t in published["targets"].items()} == TARGETS
     assert all(t["met"] for t in published["targets"].values())
-
-
-def test_stopwatch_times_calls_and_backward_passes() -> None:
-    """Each call of a method counts, and the time between a result's gradient and its input's."""
-
-    class Owner:
-        def double(self, x: torch.Tensor) -> torch.Tensor:
-            return 2.0 * x
-
-    owner, watch = Owner(), Stopwatch(torch.device("cpu"))
-    x = torch.ones(3, requires_grad=True)
-    with watch.around_gradient(owner, "double", "backward"), watch.around(owner, "double", "call"):
-        owner.double(x).sum().backward()
-        owner.double(x.detach())
-    assert set(watch.seconds) == {"call", "backward"}
-    assert x.grad is not None and x.grad.tolist() == [2.0, 2.0, 2.0]
-    before = dict(watch.seconds)
-    owner.double(x)
-    assert watch.seconds == before
