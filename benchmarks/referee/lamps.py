@@ -7,16 +7,15 @@ outside the object's convex hull where paths have more than one interaction. Lig
 render of its own in Mitsuba, and is added. Mitsuba's own ``path`` traces all of it.
 """
 
-import argparse
-import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
-from benchmarks.referee.sheet import compare_runs
+from benchmarks.referee.sheet import compare_runs, print_lines
 from benchmarks.referee.subjects import ball, from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
 from tests.builders.shapes import all_pixels
@@ -176,33 +175,26 @@ def clear_of(lamps: tuple[Lamp, ...], view: Camera) -> Float64Array:
     return clear
 
 
-def main() -> None:
-    """Print one line of JSON a comparison."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(cases()))
-    options = parser.parse_args()
+def compare(case: Case, spp: int) -> Iterator[dict[str, Any]]:
+    """Yield a line for object and ground at each depth."""
     view = from_above()
-    for name in options.cases:
-        case = cases()[name]
-        pixels = all_pixels(view)
-        r = renderer(case, view, 0)
-        mask = r.foreground(light_args(Light(texels=DARK), r.device), pixels, 64, 1, 1, 7).mask
-        covered = np.zeros(len(pixels), bool)
-        covered[r.gbuffer(3, 64).object_pixels] = True
-        everywhere = np.ones((view.height, view.width, 3), bool)
-        open_ground = everywhere & ~(covered | (mask > 0.0)).reshape(view.height, view.width, 1)
-        everywhere &= clear_of(case.lamps, view)
-        open_ground &= everywhere
-        for what, depths in (("object", case.depths), ("ground", case.ground_depths)):
-            for depth in depths:
-                is_ground = what == "ground"
-                found = ours(case, view, depth, options.spp, is_ground)
-                true = theirs(case, view, depth, options.spp, is_ground)
-                line = {"case": name, "what": what, "depth": depth, "spp": options.spp}
-                counts = open_ground if is_ground else everywhere
-                print(json.dumps(line | compare_runs(found, true, counts)), flush=True)
+    pixels = all_pixels(view)
+    r = renderer(case, view, 0)
+    mask = r.foreground(light_args(Light(texels=DARK), r.device), pixels, 64, 1, 1, 7).mask
+    covered = np.zeros(len(pixels), bool)
+    covered[r.gbuffer(3, 64).object_pixels] = True
+    everywhere = np.ones((view.height, view.width, 3), bool)
+    open_ground = everywhere & ~(covered | (mask > 0.0)).reshape(view.height, view.width, 1)
+    everywhere &= clear_of(case.lamps, view)
+    open_ground &= everywhere
+    for what, depths in (("object", case.depths), ("ground", case.ground_depths)):
+        is_ground = what == "ground"
+        for depth in depths:
+            found = ours(case, view, depth, spp, is_ground)
+            true = theirs(case, view, depth, spp, is_ground)
+            counts = open_ground if is_ground else everywhere
+            yield {"what": what, "depth": depth, **compare_runs(found, true, counts)}
 
 
 if __name__ == "__main__":
-    main()
+    print_lines(__doc__, cases(), compare)

@@ -8,8 +8,7 @@ on the object, is left out there by paths of no more vertices than coat and obje
 one interaction with the object.
 """
 
-import argparse
-import json
+from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -17,7 +16,7 @@ import numpy as np
 
 from benchmarks.referee.lamps import GROUND, HORIZON, pair, paths_of, traced
 from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
-from benchmarks.referee.sheet import compare_runs
+from benchmarks.referee.sheet import compare_runs, print_lines
 from benchmarks.referee.subjects import from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
 from tests.builders.shapes import all_pixels
@@ -64,12 +63,8 @@ def ours(asset: Asset, view: Camera, texels: FloatArray, roughness: float, spp: 
     return over_seeds(view, picture)
 
 
-def main() -> None:
-    """Print one line of JSON a roughness."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--save", default=None, help="also write both pictures to this file (npz)")
-    options = parser.parse_args()
+def compare(roughness: float, spp: int) -> Iterator[dict[str, Any]]:
+    """Yield the line of a roughness."""
     asset, view = pair(), from_above()
     texels = (sun_and_sky(np.random.default_rng(5), 16) / 8.0).astype(np.float32)
     # Our ground hides no light from the object: what comes from below stands for the ground's own.
@@ -77,14 +72,9 @@ def main() -> None:
     open_ground = np.ones((view.height, view.width, 3), bool)
     gbuffer = on_the_ground(asset, np.eye(4), view).gbuffer(3, 64)
     open_ground.reshape(-1, 3)[gbuffer.object_pixels] = False
-    for roughness in ROUGHNESSES:
-        found = ours(asset, view, texels, roughness, options.spp)
-        true = theirs(asset, view, texels, roughness, options.spp)
-        line = {"roughness": roughness, "spp": options.spp}
-        print(json.dumps(line | compare_runs(found, true, open_ground)), flush=True)
-        if options.save is not None:
-            np.savez(f"{options.save}-{roughness}.npz", ours=found.mean, theirs=true.mean)
+    found, true = (side(asset, view, texels, roughness, spp) for side in (ours, theirs))
+    yield compare_runs(found, true, open_ground)
 
 
 if __name__ == "__main__":
-    main()
+    print_lines(__doc__, {f"{r:g}": r for r in ROUGHNESSES}, compare)

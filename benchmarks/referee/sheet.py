@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,36 +26,20 @@ Pair = tuple[Runs, Runs]
 def compare_images(candidate: Any, reference: Any) -> dict[str, float | int]:
     """Test whether two unbiased estimates share one mean.
 
-    Single pixels show a local fault, blocks of pixels a small bias that noise hides in one.
-    Two estimates of one integral give ``z_std`` near 1, ``z_mean`` near 0 and
-    ``beyond_3`` near 0.0027 (more where the samples' tails are heavy). Both hold mean, variance of
-    the mean and coverage, as `warpir.mitsuba.render.Foreground`, of independent samples.
+    Both hold mean, variance of the mean and coverage, as `warpir.mitsuba.render.Foreground`, of
+    independent samples.
 
     Returns:
-        Statistics of the z scores per pixel and channel (``z_*``, ``beyond_3``) and per block
-        (``block_*``), relative RMSE, relative bias and its standard error, pixels whose
-        variance is 0 on both sides but whose means differ, largest difference in coverage.
+        `z_scores`, relative RMSE, relative bias and its standard error, pixels whose variance is 0
+        on both sides but whose means differ, largest difference in coverage.
     """
     difference = candidate.mean - reference.mean
     variance = candidate.variance + reference.variance
-    noisy = variance > 0.0
-    z = difference[noisy] / np.sqrt(variance[noisy])
-    total, total_variance = block_sums(difference), block_sums(variance)
-    used = total_variance > 0.0
-    block_z = total[used] / np.sqrt(total_variance[used])
     power = reference.mean.sum()
     scale = np.abs(reference.mean).max()
-    silent = ~noisy & (np.abs(difference) > 1e-5 * scale)
+    silent = (variance == 0.0) & (np.abs(difference) > 1e-5 * scale)
     return {
-        "z_count": int(z.size),
-        "z_mean": float(z.mean()),
-        "z_std": float(z.std()),
-        "z_max": float(np.abs(z).max()),
-        "beyond_3": float((np.abs(z) > 3.0).mean()),
-        "block_z_mean": float(block_z.mean()),
-        "block_z_std": float(block_z.std()),
-        "block_z_max": float(np.abs(block_z).max()),
-        "block_count": int(block_z.size),
+        **z_scores(difference, variance),
         "relative_rmse": float(
             np.sqrt(np.square(difference).mean() / np.square(reference.mean).mean())
         ),
@@ -70,46 +54,73 @@ def compare_images(candidate: Any, reference: Any) -> dict[str, float | int]:
 
 
 def compare_runs(a: Runs, b: Runs, counts: BoolArray) -> dict[str, float]:
-    """Return z scores of pixels and of blocks, over pixels that count."""
+    """Return `z_scores`, relative RMSE and relative bias over pixels that count."""
     # Where hardly a path brings light, the spread of samples says nothing of their error.
     floor = FLOOR * np.sqrt(np.square(b.mean[counts & (b.mean != 0.0)]).mean())
-    variance = a.variance + b.variance + floor**2
     seen = counts & ((a.mean != 0.0) | (b.mean != 0.0))
-    z = (a.mean - b.mean)[seen] / np.sqrt(variance[seen])
-    off, spread = (block_sums(np.where(seen, plane, 0.0)) for plane in (a.mean - b.mean, variance))
-    of_blocks = off[spread > 0.0] / np.sqrt(spread[spread > 0.0])
-    level = np.sqrt(np.square(b.mean[seen]).mean())
-    difference = (a.mean - b.mean)[seen]
+    difference = np.where(seen, a.mean - b.mean, 0.0)
+    variance = np.where(seen, a.variance + b.variance + floor**2, 0.0)
+    energy, power = np.square(b.mean[seen]).sum(), np.abs(b.mean[seen]).sum()
     return {
         "pixels": int(seen.any(axis=-1).sum()),
+        **z_scores(difference, variance),
+        "relative_rmse": float(np.sqrt(np.square(difference).sum() / energy)),
+        "expected_rmse": float(np.sqrt(variance.sum() / energy)),
+        "relative_bias": float(difference.sum() / power),
+        "relative_bias_error": float(np.sqrt(variance.sum()) / power),
+    }
+
+
+def z_scores(difference: Float64Array, variance: Float64Array) -> dict[str, float]:
+    """Return statistics of the z scores of pixels and channels, and of blocks of pixels.
+
+    Single pixels show a local fault, blocks of pixels a small bias that noise hides in one.
+    Two estimates of one integral give ``z_std`` near 1, ``z_mean`` near 0 and
+    ``beyond_3`` near 0.0027 (more where the samples' tails are heavy). What has no variance is not
+    counted.
+    """
+    noisy = variance > 0.0
+    z = difference[noisy] / np.sqrt(variance[noisy])
+    total, total_variance = block_sums(difference), block_sums(variance)
+    used = total_variance > 0.0
+    block_z = total[used] / np.sqrt(total_variance[used])
+    return {
         "z_mean": float(z.mean()),
         "z_std": float(z.std()),
         "beyond_3": float((np.abs(z) > 3.0).mean()),
-        "block_z_std": float(of_blocks.std()),
-        "block_z_max": float(np.abs(of_blocks).max()),
-        "relative_rmse": float(np.sqrt(np.square(difference).mean()) / level),
-        "expected_rmse": float(np.sqrt(variance[seen].mean()) / level),
-        "relative_bias": float(difference.sum() / np.abs(b.mean[seen]).sum()),
-        "relative_bias_error": float(np.sqrt(variance[seen].sum()) / np.abs(b.mean[seen]).sum()),
+        "block_z_std": float(block_z.std()),
+        "block_z_max": float(np.abs(block_z).max()),
     }
+
+
+def print_lines(
+    about: str,
+    known: dict[str, CaseT],
+    compare: Callable[[CaseT, int], Iterable[dict[str, Any]]],
+) -> None:
+    """Print the comparisons of each case, at so many samples, as lines of JSON."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--spp", type=int, default=4096)
+    parser.add_argument("--cases", nargs="*", default=list(known))
+    options = parser.parse_args()
+    for name in options.cases:
+        for line in compare(known[name], options.spp):
+            print(json.dumps({"case": name, "spp": options.spp} | line), flush=True)
 
 
 def compare_cases(
     about: str, known: dict[str, CaseT], render: Callable[[CaseT, Camera, FloatArray, int], Pair]
 ) -> None:
-    """Print one line of JSON a comparison; ``render`` returns our picture of a case and theirs."""
-    parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--spp", type=int, default=4096)
-    parser.add_argument("--cases", nargs="*", default=list(known))
-    options = parser.parse_args()
+    """Print a line a case; ``render`` returns our picture of it and theirs."""
     view = from_above(64, 64, 1.6)
     # Every direction differs, and none is so bright that noise would hide an error.
     texels = (2.0 * np.random.default_rng(5).random((16, 32, 3)) ** 3).astype(np.float32)
     everywhere = np.ones((view.height, view.width, 3), bool)
-    for name in options.cases:
-        line = {"case": name, "spp": options.spp}
-        found, true = render(known[name], view, texels, options.spp)
-        print(json.dumps(line | compare_runs(found, true, everywhere)), flush=True)
+
+    def compare(case: CaseT, spp: int) -> Iterator[dict[str, Any]]:
+        yield compare_runs(*render(case, view, texels, spp), everywhere)
+
+    print_lines(about, known, compare)
 
 
 def display_rmse(candidate: Float64Array, reference: Float64Array) -> float:
