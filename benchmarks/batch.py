@@ -8,7 +8,6 @@ them must leave the same bytes. Prints a table in Markdown, for docs/batch.md; C
 was saved on a machine that others use too.
 """
 
-import argparse
 import json
 import os
 import resource
@@ -22,7 +21,7 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks.measure import context, report
+from benchmarks.measure import context, flags, report, table
 from warpir.core.memory import core_count
 
 WORKERS = (1, 2)
@@ -31,11 +30,10 @@ wp.config.log_level = wp.LOG_ERROR
 
 def main() -> None:
     """Measure, compare and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = flags(__doc__, "json")
     parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--out", type=Path, help="where results go for a while (default: TMPDIR)")
-    parser.add_argument("--json", type=Path, help="append the figures to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.out, prefix="warpir-bench-") as folder:
         measure(Path(folder), options.scenes, options.samples, options.json)
@@ -47,17 +45,17 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
     Raises:
         AssertionError: Two ways leave other bytes.
     """
-    flags = ["--demo", "--guidance", "none", "--device", "cpu", "--samples", str(samples)]
+    same = ["--demo", "--guidance", "none", "--device", "cpu", "--samples", str(samples)]
     rows = [{"name": f"scene-{seed}", "seed": seed} for seed in range(count)]
     (folder / "scenes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
     def singly(out: Path, seeds: range) -> None:
         for seed in seeds:
             scene = ["--seed", str(seed), "--out", str(out / f"scene-{seed}")]
-            run("warpir.insert", [*flags, *scene])
+            run("warpir.insert", [*same, *scene])
 
     def batch(out: Path, workers: int) -> None:
-        argv = [str(folder / "scenes.jsonl"), *flags, "--workers", str(workers)]
+        argv = [str(folder / "scenes.jsonl"), *same, "--workers", str(workers)]
         run("warpir.batch", [*argv, "--out", str(out)])
 
     singly(folder / "warm", range(1))  # no compilation is measured
@@ -76,11 +74,12 @@ def measure(folder: Path, count: int, samples: int, path: Path | None) -> None:
             files.pop("report.html", None)  # which tells the seconds
     assert written[1:] == written[:-1], "the bytes differ"
     print(f"{count} scenes of {samples} samples, {len(written[0][0])} files each, the same bytes")
-    print("\n| | s | CPU s | scenes a minute | |\n|---|---|---|---|---|")
     first = next(iter(spent.values()))[0]
-    for name, (seconds, cpu) in spent.items():
-        rate = f"{60.0 * count / seconds:.1f} | {first / seconds:.2f} x"
-        print(f"| {name} | {seconds:.1f} | {cpu:.1f} | {rate} |")
+    cells = (
+        (name, f"{s:.1f}", f"{cpu:.1f}", f"{60.0 * count / s:.1f}", f"{first / s:.2f} x")
+        for name, (s, cpu) in spent.items()
+    )
+    print("\n" + table(("", "s", "CPU s", "scenes a minute", ""), cells))
     cores = core_count()
     figures: dict[str, Any] = {
         "question": "batch",

@@ -23,6 +23,7 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, given, settings
 
 from benchmarks.damage.formats import Format, formats, weights
+from benchmarks.measure import write_json
 from warpir.core.errors import ExitCode
 
 SECONDS = 10.0
@@ -210,9 +211,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                   flush=True)  # fmt: skip
             for fault in row.faults[:FAULTS_SHOWN]:
                 print(f"    {fault}", flush=True)
-    if options.json is not None:
-        found = {"count": options.count, "formats": rows}
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    write_json(options.json, {"count": options.count, "formats": rows})
     return int(any(row["faults"] for row in rows))
 
 

@@ -10,7 +10,6 @@ shadow mask, with the wall as the mesh of `--proxy`, and with wall and ground as
 of display values, over the box of all that the car changes in the truth and over the whole picture.
 """
 
-import json
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import flags
+from benchmarks.measure import flags, report
 from benchmarks.scenes import on_the_ground, photo_of, write_picture
 from tests.builders.shapes import box
 from tools.demo.textures import paving_texture
@@ -255,7 +254,7 @@ def main() -> None:
     yard = Yard(*ground_and_wall(), load_asset(ASSET), camera, options.samples)
     texels = read_envmap(options.panorama)
     azimuth = angles_from_axis(lamp_axes(Light(texels=texels))[0])[0]
-    rows, figures = [], []
+    rows = []
     photos: dict[float, tuple[FloatArray, float, PixelArray]] = {}
     for case in CASES:
         if case.sun_azimuth not in photos:
@@ -264,12 +263,9 @@ def main() -> None:
             photos[case.sun_azimuth] = (turned, *yard.empty(turned))
         row, lines = compare(case, yard, *photos[case.sun_azimuth], device)
         rows.append(row)
-        figures += lines
         for line in lines:
-            print(line, flush=True)
+            report(line, options.json)
     write_picture(options.out / "proxy.png", np.concatenate(rows, axis=0))
-    if options.json is not None:
-        options.json.write_text("".join(json.dumps(f) + "\n" for f in figures))
 
 
 if __name__ == "__main__":

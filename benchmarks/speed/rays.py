@@ -3,17 +3,18 @@
 python -m benchmarks.speed.rays [--device cpu]
 """
 
-import argparse
-import time
+from functools import partial
 
 import numpy as np
 import warp as wp
 
+from benchmarks.measure import flags, seconds
 from benchmarks.scenes import on_the_ground
 from warpir.demo import ASSET
 from warpir.io.assets import load_asset
 from warpir.kernels.tracing.triangles import any_triangle, closest_triangle
 from warpir.kernels.types import MeshArgs
+from warpir.render.device import choose_device
 from warpir.render.device_scene import Scene
 from warpir.scene.camera import Camera
 
@@ -54,9 +55,7 @@ def rays_of(scene: Scene, rng: np.random.Generator) -> dict[str, tuple[np.ndarra
 
 def main() -> None:
     """Print a line per tree and kind of ray."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="cpu")
-    device = wp.get_device(parser.parse_args().device)
+    device = wp.get_device(choose_device(flags(__doc__, "device").parse_args().device))
     camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
     scene = on_the_ground(load_asset(ASSET), np.eye(4), camera, device.alias).scene
     trees = {"Warp": MeshArgs(), "Embree": scene.mesh_args}
@@ -69,13 +68,9 @@ def main() -> None:
         for kind, kernel in (("any", cast_any), ("closest", cast_closest)):
             for tree, mesh in trees.items():
                 hits = wp.zeros(RAYS, dtype=int, device=device)
-                wp.launch(kernel, 1, [mesh, *arrays, hits], device=device)
-                wp.synchronize_device(device)
-                start = time.perf_counter()
-                wp.launch(kernel, RAYS, [mesh, *arrays, hits], device=device)
-                wp.synchronize_device(device)
-                seconds = time.perf_counter() - start
-                rate, share = RAYS / seconds / 1e6, hits.numpy().mean()
+                inputs = [mesh, *arrays, hits]
+                spent, _ = seconds(partial(wp.launch, kernel, RAYS, inputs, device=device), device)
+                rate, share = RAYS / spent / 1e6, hits.numpy().mean()
                 print(f"{where:8} {kind:8} {tree:7} {rate:7.1f} M/s, {share:.3f} hit")
 
 
