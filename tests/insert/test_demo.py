@@ -9,7 +9,7 @@ from tools.demo.car import car
 from tools.demo.distance import mesh_distance
 from tools.demo.make import without_fireflies
 from tools.demo.mesh import ellipsoid, lathe, rounded_box, split, tube
-from tools.demo.place import HEIGHT, WIDTH, camera, placement
+from tools.demo.place import HEIGHT, WIDTH, camera, car_to_world
 from tools.demo.sky import LUMINANCE, SKY_IRRADIANCE, SUN_TO_SKY, sky, sun_direction
 from warpir import demo
 from warpir.app.config import InsertConfig
@@ -90,7 +90,7 @@ def test_car_is_in_the_picture() -> None:
 
 def car_corners() -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the shipped car's box in the picture [px]."""
-    matrix = placement().matrix()
+    matrix = car_to_world()
     pixels = np.concatenate(
         [
             camera().project(p.positions @ matrix[:3, :3].T + matrix[:3, 3])
@@ -133,12 +133,11 @@ def test_demo_config_names_files_that_exist() -> None:
 
 def test_demo_config_keeps_what_the_user_named() -> None:
     """A place, a pixel, a turn; and exposure and tone under its own light."""
-    where = placement()
     named = demo.demo_config(InsertConfig(demo=True, place=(1.0, 0.0, -9.0), rotate_y=20.0))
     assert (named.placement.place, named.placement.rotate_y) == ((1.0, 0.0, -9.0), 20.0)
     pixel = demo.demo_config(InsertConfig(demo=True, at=(600.0, 700.0)))
     stands = pixel.placement
-    assert (stands.place, stands.at, stands.rotate_y) == (None, (600.0, 700.0), where.rotate_y)
+    assert (stands.place, stands.at, stands.rotate_y) == (None, (600.0, 700.0), demo.ROTATE_Y)
     lit = InsertConfig(demo=True, guidance="none", exposure=1.0, tone="reinhard")
     light = demo.demo_config(lit).light
     assert (light.exposure, light.tone) == (1.0, "reinhard")

@@ -12,20 +12,19 @@ bytes on the same device.
 import argparse
 import json
 from pathlib import Path
-from shutil import copyfile
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from tools.demo.car import car
-from tools.demo.place import background, camera, placement
+from tools.demo.place import background, camera, car_to_world
 from tools.demo.sky import sky
 from warpir.core.color import codes_of, linear_to_gamma
 from warpir.core.latlong import look_up
 from warpir.demo import ASSET, CAMERA, LIGHT, PHOTO, WET_PHOTO
 from warpir.io.gltf.writer import write_glb
+from warpir.io.images.writers import envmap_exr_bytes
 
 DEPTH = 4
 """Surface hits of a light path in the photo."""
@@ -53,14 +52,9 @@ def write_light(texels: NDArray[np.float32], path: Path) -> None:
         texels: Radiance, relative [W/(m^2 sr)], shape [He, 2 He, 3].
         path: The ``.exr`` file, replaced when it exists.
     """
-    from warpir.io.results import OutputFolder
-
     bits = np.ascontiguousarray(texels, dtype=np.float32).view(np.uint32)
     rounded = ((bits + np.uint32(1 << 12)) & np.uint32(0xFFFFE000)).view(np.float32)
-    with TemporaryDirectory() as folder:
-        with OutputFolder(Path(folder) / "light") as staged:
-            staged.write_envmap(rounded, path.stem)
-        copyfile(Path(folder) / "light" / path.name, path)
+    path.write_bytes(envmap_exr_bytes(path, rounded))
 
 
 def render(
@@ -84,7 +78,7 @@ def render(
     view = camera()
     objects = [Placed(background(is_wet), np.eye(4))]
     if with_car:
-        objects.append(Placed(car(), placement().matrix()))
+        objects.append(Placed(car(), car_to_world()))
     # The ground is part of the place; the analytic plane is put out of the way.
     buried = Receiver(np.array([0.0, 1.0, 0.0]), -1000.0)
     scene = Scene(objects, view, buried, choose_device(device))

@@ -25,7 +25,7 @@ from tools.demo.textures import PAVED, brick_texture, paving_texture, plaster_te
 from warpir.core.arrays import Float64Array
 from warpir.demo import PLACE, ROTATE_Y, WET_ROUGHNESS
 from warpir.scene.asset import Asset, Material, Primitive, TextureSlot
-from warpir.scene.camera import Camera
+from warpir.scene.camera import Camera, camera_from_fov
 
 WIDTH, HEIGHT = 1280, 853
 FIELD_OF_VIEW, PITCH, EYE_HEIGHT = 50.0, -3.8, 1.55
@@ -63,23 +63,6 @@ LAMP_POST = [
 ]  # fmt: skip
 """Profiles (height, radius) [m]."""
 NUMBER = {material.name: k for k, material in enumerate(MATERIALS)}
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where the car stands."""
-
-    place: tuple[float, float, float] = PLACE
-    """Point on the ground under the car's origin, world frame [m]."""
-    rotate_y: float = ROTATE_Y
-    """Turn about +Y, from the front toward +X [deg]."""
-
-    def matrix(self) -> Float64Array:
-        """Return asset to world, column vectors, shape [4, 4]."""
-        asset_to_world = np.eye(4)
-        asset_to_world[:3, :3] = rotation("y", self.rotate_y)
-        asset_to_world[:3, 3] = self.place
-        return asset_to_world
 
 
 @dataclass
@@ -347,13 +330,12 @@ def background(is_wet: bool = False) -> Asset:
 
 def camera() -> Camera:
     """Return the photo's camera, at eye height, looking along -Z and a little down."""
-    focal = 0.5 * WIDTH / np.tan(np.radians(0.5 * FIELD_OF_VIEW))
-    c2w = np.eye(4)
-    c2w[:3, :3] = rotation("x", PITCH)
-    c2w[1, 3] = EYE_HEIGHT
-    return Camera(WIDTH, HEIGHT, focal, focal, 0.5 * WIDTH, 0.5 * HEIGHT, c2w)
+    return camera_from_fov(WIDTH, HEIGHT, FIELD_OF_VIEW, PITCH, EYE_HEIGHT)
 
 
-def placement() -> Placement:
-    """Return where the car stands: three-quarter view, about a third of the picture's width."""
-    return Placement()
+def car_to_world() -> Float64Array:
+    """Return the pose of the car, column vectors, shape [4, 4]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation("y", ROTATE_Y)
+    matrix[:3, 3] = PLACE
+    return matrix
