@@ -18,7 +18,7 @@ from benchmarks.referee.ours import SEED_COUNT, Runs, over_seeds
 from benchmarks.referee.sheet import compare_runs, print_lines
 from benchmarks.referee.subjects import ball, from_above, sun_and_sky
 from benchmarks.scenes import on_the_ground
-from tests.builders.shapes import all_pixels
+from tests.builders.shapes import all_pixels, quad
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.mitsuba.render import ObjectScene, build, mean_and_variance, sums
 from warpir.render.device_light import light_args
@@ -39,28 +39,21 @@ GLOSS = Material(base_color=(0.7, 0.4, 0.2), metallic=0.3, roughness=0.35)
 PAPER = Material(base_color=(0.8, 0.8, 0.7), metallic=0.0, roughness=0.8, double_sided=True)
 
 
-def card(corner: tuple[float, ...], x: tuple[float, ...], y: tuple[float, ...]) -> Primitive:
-    """Return a flat parallelogram in the second material."""
-    c, a, b = (np.array(v) for v in (corner, x, y))
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Primitive(np.array([c, c + a, c + a + b, c + b]), faces, 1)
-
-
 def pair() -> Asset:
     """Return a glossy ball before an upright card."""
     small = ball()
     round_one = Primitive(0.4 * small.positions + [0.0, 0.41, 0.0], small.indices, 0, small.normals)
-    upright = card((-0.8, 0.01, -0.6), (1.6, 0, 0), (0, 1.0, 0))
+    upright = quad((0, 0.51, -0.6), (0.8, 0, 0), (0, 0.5, 0), 1)
     return Asset("pair", (round_one, upright), (GLOSS, PAPER))
 
 
 def shade() -> Asset:
     """Return four walls around a lamp, open above and just off the ground."""
     walls = (
-        card((-0.4, 0.1, 0.4), (0.8, 0, 0), (0, 0.7, 0)),
-        card((0.4, 0.1, 0.4), (0, 0, -0.8), (0, 0.7, 0)),
-        card((0.4, 0.1, -0.4), (-0.8, 0, 0), (0, 0.7, 0)),
-        card((-0.4, 0.1, -0.4), (0, 0, 0.8), (0, 0.7, 0)),
+        quad((0, 0.45, 0.4), (0.4, 0, 0), (0, 0.35, 0), 1),
+        quad((0.4, 0.45, 0), (0, 0, -0.4), (0, 0.35, 0), 1),
+        quad((0, 0.45, -0.4), (-0.4, 0, 0), (0, 0.35, 0), 1),
+        quad((-0.4, 0.45, 0), (0, 0, 0.4), (0, 0.35, 0), 1),
     )
     return Asset("shade", walls, (GLOSS, PAPER))
 

@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.stability.case import Measured, finite, lit
 from benchmarks.stability.rays import leave, mitsuba_scene, mitsuba_trace
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, camera, ground, placed, quad, sphere
+from tests.builders.shapes import all_pixels, camera, ground, placed, quad, sphere, view_rays
 from warpir.render.device_scene import Scene
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.scene.asset import Material, Primitive
@@ -81,17 +81,13 @@ def inside_out(device: str, reverse: bool) -> Measured:
     renderer, args = lit(device, [placed(part, material)], view)
     out = renderer.foreground(args, all_pixels(view), 1024, 1, 2, 0)
     # Closed form at 8 x 8 points of each pixel.
-    side = (np.arange(12 * 8) + 0.5) / 8
-    u, v = np.meshgrid((side - 6.0) / 30.0, -(side - 6.0) / 30.0)
-    d = o.normalize(np.stack([u, v, -np.ones_like(u)], axis=-1))
-    along = -5.0 * d[..., 2]
+    along = -5.0 * view_rays(view, 8)[..., 2]
     rest = 1.0 - (25.0 - along**2)
     cosine = np.sqrt(np.maximum(rest, 0.0))
     knots = np.linspace(0.2, 1.0, 9)
     values = [o.gltf_albedo(float(c), 0.8, 0.0, 1.0) for c in knots]
-    blocks = (12, 8, 12, 8)
-    inside = (cosine > 0.25).reshape(blocks).all(axis=(1, 3)).ravel()
-    truth = np.interp(cosine, knots, values).reshape(blocks).mean(axis=(1, 3)).ravel()
+    inside = (cosine > 0.25).all(axis=1)
+    truth = np.interp(cosine, knots, values).mean(axis=1)
     found = out.radiance[:, 0].astype(np.float64)
     error = found[inside] / truth[inside] - 1.0
     return Measured(float(np.sqrt(np.mean(error**2))), finite(out.radiance))

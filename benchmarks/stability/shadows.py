@@ -6,7 +6,7 @@ from benchmarks.measure import rms
 from benchmarks.stability.case import Float64Array, Measured, finite, lit
 from benchmarks.stability.rays import AWAY, mitsuba_visible
 from tests import oracles as o
-from tests.builders.shapes import all_pixels, box, camera, placed, quad
+from tests.builders.shapes import all_pixels, box, camera, placed, quad, seen_ground
 from warpir.scene.asset import Primitive
 from warpir.scene.camera import Camera
 
@@ -21,12 +21,8 @@ def from_above(width: int, height: int, metres: float, size: float, away: float)
 
 def foot(view: Camera, side: int) -> Float64Array:
     """The plane's x and z at ``side x side`` points of each pixel, size 1, [pixel, side^2, 2]."""
-    metres = 50.0 / view.fx
-    u = ((np.arange(view.width * side) + 0.5) / side - view.cx) * metres
-    v = ((np.arange(view.height * side) + 0.5) / side - view.cy) * metres
-    grid = np.stack(np.meshgrid(u, v), axis=-1)
-    blocks = grid.reshape(view.height, side, view.width, side, 2).swapaxes(1, 2)
-    return blocks.reshape(-1, side * side, 2)
+    at_one = from_above(view.width, view.height, 50.0 / view.fx, 1.0, 0.0)
+    return seen_ground(at_one, side)[..., [0, 2]]
 
 
 def ratio_of(
