@@ -1,11 +1,11 @@
 """How far are the hard cases from float64, and how far is Mitsuba 3 on the same case?
 
-    python -m benchmarks.stability [--device cpu|cuda] [--quick] [--json FILE] [--docs FILE]
+    python -m benchmarks.stability [--device cpu|cuda] [--json FILE] [--docs FILE]
 
 Lobes, materials, geometry, light, tone and fusion at the ends of their ranges. Truth comes from the
 float64 oracles of the tests, closed forms and quadrature, never from the kernels. `tests/
 test_stability.py` asserts the bounds of the same cases. Mitsuba's part is left out, and says so,
-where it is not installed. ``--quick`` takes only cases of less than a second.
+where it is not installed.
 """
 
 import math
@@ -21,18 +21,6 @@ from benchmarks.measure import context, flags, report, table
 from benchmarks.stability import brdf, geometry, light, lobes, near
 from benchmarks.stability.case import Case
 from warpir.render.device import choose_device
-
-TITLES = {
-    "lobes": "Spherical Gaussians",
-    "brdf": "Material",
-    "geometry": "Geometry",
-    "light": "Maps and shadow ratio",
-    "tone": "Tone and encoding",
-    "fusion": "Fusion of two lights",
-    "lamps": "Lamps near the object",
-    "coat": "Glossy ground",
-    "glass": "Solid glass",
-}
 
 
 def cases() -> list[Case]:
@@ -123,7 +111,7 @@ def document(records: list[dict[str, Any]], where: dict[str, Any], command: str)
         mitsuba = r["mitsuba"] if isinstance(r["mitsuba"], str) else number(r["mitsuba"])
         rows.append(
             (
-                *(TITLES[r["group"]], r["case"], r["quantity"], r["measure"]),
+                *(r["group"], r["case"], r["quantity"], r["measure"]),
                 *(f"{number(r['error'])} / {number(r['bound'])}", gradient),
                 *("yes" if r["finite"] else "**no**", mitsuba.replace("|", "/")),
             )
@@ -144,7 +132,6 @@ def document(records: list[dict[str, Any]], where: dict[str, Any], command: str)
 def main() -> None:
     """Run the cases, print one JSON line each, and write the table."""
     parser = flags(__doc__, "device", "json")
-    parser.add_argument("--quick", action="store_true", help="only cases of less than a second")
     parser.add_argument("--docs", type=Path, help="write the table to this file")
     args = parser.parse_args()
     device = choose_device(args.device)
@@ -157,14 +144,11 @@ def main() -> None:
     where["mitsuba"] = version("mitsuba") if has_mitsuba else None
     records = []
     for case in cases():
-        if args.quick and case.cost != "quick":
-            continue
         record = measure(case, device, has_mitsuba)
         report({**record, "commit": where["commit"], "device": where["device"]}, args.json)
         records.append(record)
     if args.docs is not None:
-        quick = " --quick" * args.quick
-        command = f"python -m benchmarks.stability --device {device}{quick} --docs FILE"
+        command = f"python -m benchmarks.stability --device {device} --docs FILE"
         args.docs.write_text(document(records, where, command), encoding="utf-8")
     outside = [f"{r['group']}: {r['case']}, {r['quantity']}" for r in records if not is_kept(r)]
     print(f"{len(records)} cases, {len(outside)} outside their bounds", *outside, sep="\n")

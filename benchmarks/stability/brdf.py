@@ -359,7 +359,7 @@ def mitsuba_frame() -> float:
 
 def cases() -> list[Case]:
     """Return the rows of this group."""
-    group = "brdf"
+    group = "Material"
     below = "zero by definition there as well"
     through = "another integral: it lets light through below the geometric surface"
     widths = {f"roughness {r:g}": (r,) for r in ROUGHNESS}
@@ -382,6 +382,6 @@ def cases() -> list[Case]:
         *table(group, widths, of_pairs, of_density, of_samples),
         *table(group, flat, of_grazing),
         *table(group, {"directions below the surface": ()}, away),
-        *table(group, leaning, tilted, cost="medium"),
+        *table(group, leaning, tilted),
         *table(group, {"normals next to -Z and +Z": ()}, round_it),
     ]

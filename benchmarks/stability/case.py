@@ -55,8 +55,8 @@ class Case:
     gradient_bound: float | None = None
     mitsuba: Callable[[], float] | str = ""
     """Mitsuba's error in the same measure, or why it cannot run the case."""
-    cost: str = "quick"
-    """``quick`` takes less than a second, ``medium`` a few, ``slow`` up to a minute."""
+    is_slow: bool = False
+    """Whether it takes up to a minute, not a few seconds at most."""
 
     @property
     def id(self) -> str:
@@ -77,7 +77,7 @@ class Quantity(NamedTuple):
 
 
 def table(
-    group: str, inputs: Mapping[str, tuple[Any, ...]], *quantities: Quantity, cost: str = "quick"
+    group: str, inputs: Mapping[str, tuple[Any, ...]], *quantities: Quantity, is_slow: bool = False
 ) -> list[Case]:
     """Return a case for each quantity on each input, whose name stands beside its values."""
     return [
@@ -90,7 +90,7 @@ def table(
             quantity.bound(*values) if callable(quantity.bound) else quantity.bound,
             quantity.gradient_bound,
             partial(quantity.mitsuba, *values) if callable(quantity.mitsuba) else quantity.mitsuba,
-            cost,
+            is_slow,
         )
         for name, values in inputs.items()
         for quantity in quantities

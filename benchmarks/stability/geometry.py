@@ -3,7 +3,7 @@
 from benchmarks.stability import broken, rays, shadows
 from benchmarks.stability.case import MAX_ABSOLUTE, RELATIVE, SHARE, Case, Quantity, table
 
-GROUP, RMS = "geometry", "RMS absolute"
+GROUP, RMS = "Geometry", "RMS absolute"
 PLACES = {
     "1 mm wide": (1e-3, 0.0),
     "1 m wide": (1.0, 0.0),
@@ -120,7 +120,7 @@ def of_meshes() -> list[Case]:
         *table(GROUP, cards, twins),
         *table(GROUP, {"two sheets of opacity 0.25 in one place": ()}, sheets),
         *table(GROUP, {needle_name(w): (w,) for w in (1e-2, 1e-3)}, needles),
-        *table(GROUP, {needle_name(w): (w,) for w in (1e-4, 1e-5)}, needles, cost="medium"),
+        *table(GROUP, {needle_name(w): (w,) for w in (1e-4, 1e-5)}, needles),
     ]
 
 
@@ -133,9 +133,9 @@ def of_shading() -> list[Case]:
     name, measure = "first hits, rays that leave", "max over the diagonal, share"
     many = Quantity(name, measure, rays.many_triangles, SAGITTA, rays.mitsuba_many_triangles)
     return [
-        *table(GROUP, balls, matt, cost="medium"),
-        *table(GROUP, {"a view of one pixel": ()}, half, cost="medium"),
-        *table(GROUP, {"two million triangles": ()}, many, cost="slow"),
+        *table(GROUP, balls, matt),
+        *table(GROUP, {"a view of one pixel": ()}, half),
+        *table(GROUP, {"two million triangles": ()}, many, is_slow=True),
     ]
 
 

@@ -16,7 +16,7 @@ from benchmarks.stability.case import (
 )
 
 PEAK = "max over the peak"
-LIGHT, TONE, FUSION = "light", "tone", "fusion"
+LIGHT, TONE, FUSION = "Maps and shadow ratio", "Tone and encoding", "Fusion of two lights"
 
 LOOKUP_ULPS = 4.0
 """A bilinear weight is what is left of ``u * width``: four roundings of ``width * 2^-24``."""
@@ -122,12 +122,12 @@ def of_maps() -> list[Case]:
     return [
         *table(LIGHT, PLAIN | SUN, lookup, density, under),
         *table(LIGHT, GLARE, lookup, under),
-        *table(LIGHT, LARGE, lookup, density, cost="slow"),
+        *table(LIGHT, LARGE, lookup, density, is_slow=True),
         *table(LIGHT, PLANES, plane),
         *table(LIGHT, SMALL_PLANES, small),
         *table(LIGHT, {"black map": ()}, dark),
         *table(LIGHT, SUN, power),
-        *table(LIGHT, LARGE, power, cost="slow"),
+        *table(LIGHT, LARGE, power, is_slow=True),
         *table(LIGHT, levels, ratio),
     ]
 

@@ -203,7 +203,7 @@ def cdf_bound(sharpness: float) -> float:
 def cases() -> list[Case]:
     """Return the rows of this group."""
     return table(
-        "lobes",
+        "Spherical Gaussians",
         {f"sharpness {s:g}": (s,) for s in SHARPNESS},
         Quantity("radiance", MAX_RELATIVE, radiance, VALUE, mitsuba_radiance),
         Quantity("sampling", "max CDF distance", sampling, cdf_bound, mitsuba_sampling),

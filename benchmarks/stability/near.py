@@ -29,7 +29,7 @@ from warpir.render.near.places import place_slopes
 from warpir.scene.asset import Material, Primitive
 from warpir.scene.near.lamps import RectangleLamp, SphereLamp
 
-LAMPS, COAT, GLASS = "lamps", "coat", "glass"
+LAMPS, COAT, GLASS = "Lamps near the object", "Glossy ground", "Solid glass"
 REFEREE = "see docs/referee.md"
 BELOW = {
     "0.1 mm wide, 1 m up": (5e-5, 1.0),
@@ -191,9 +191,9 @@ def cases() -> list[Case]:
     direction = Quantity("direction", MAX_ABSOLUTE, mirror_direction, MIRROR, REFEREE)
     kept = Quantity("furnace", RELATIVE, furnace, MIRROR, REFEREE)
     return [
-        *table(LAMPS, BELOW, sphere_lit, cost="medium"),
-        *table(LAMPS, PANELS, panel_lit, cost="medium"),
-        *table(LAMPS, {"lamp in a closed box": ()}, outside, cost="medium"),
+        *table(LAMPS, BELOW, sphere_lit),
+        *table(LAMPS, PANELS, panel_lit),
+        *table(LAMPS, {"lamp in a closed box": ()}, outside),
         *table(COAT, GRAZING, weight, direction),
         *table(COAT, ROUGH, Quantity("albedo", RELATIVE, albedo, ALBEDO, REFEREE)),
         *table(GLASS, BODIES, kept),

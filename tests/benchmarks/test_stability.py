@@ -18,7 +18,7 @@ from warpir.render.device import choose_device
 
 def marked(case: Case) -> object:
     """Return a case as a test parameter; long ones carry the mark ``slow``."""
-    marks = [pytest.mark.slow] if case.cost == "slow" else []
+    marks = [pytest.mark.slow] if case.is_slow else []
     return pytest.param(case, id=case.id, marks=marks)
 
 
@@ -60,13 +60,13 @@ def test_a_case_can_fail(measured: Measured) -> None:
 
 
 def test_the_page_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    good = Case("light", "n", "q", "m", lambda device: Measured(0.5, True), 1.0, None, "none")
+    good = Case("g", "n", "q", "m", lambda device: Measured(0.5, True), 1.0, None, "none")
     page = tmp_path / "page.md"
     monkeypatch.setattr(stability, "cases", lambda: [good])
-    monkeypatch.setattr(sys, "argv", ["stability", "--quick", "--docs", str(page)])
+    monkeypatch.setattr(sys, "argv", ["stability", "--docs", str(page)])
     stability.main()
     device = choose_device(None)
-    assert f"python -m benchmarks.stability --device {device} --quick --docs" in page.read_text()
+    assert f"python -m benchmarks.stability --device {device} --docs" in page.read_text()
 
 
 def test_errors_see_what_is_not_finite() -> None:
