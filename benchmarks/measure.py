@@ -42,8 +42,8 @@ def flags(doc: str | None, *names: str) -> argparse.ArgumentParser:
     return parser
 
 
-def seconds(work: Callable[[], object], device: wp.Device) -> tuple[float, float]:
-    """Return median and half the interquartile range of run times [s], after a warm-up."""
+def seconds(work: Callable[[], object], device: wp.Device) -> float:
+    """Return the median of seven run times [s], after a warm-up."""
     work()
     wp.synchronize_device(device)
     times = []
@@ -52,8 +52,7 @@ def seconds(work: Callable[[], object], device: wp.Device) -> tuple[float, float
         work()
         wp.synchronize_device(device)
         times.append(time.perf_counter() - start)
-    low, middle, high = np.percentile(times, [25, 50, 75])
-    return float(middle), float(0.5 * (high - low))
+    return float(np.median(times))
 
 
 def peak_mib(device: wp.Device) -> float:

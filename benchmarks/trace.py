@@ -88,9 +88,9 @@ def main() -> None:
         hits = wp.zeros(SIDE * SIDE, dtype=float, device=device)
 
         run = partial(launch, renderer, pixels, hits)
-        primary, primary_spread = seconds(partial(run, 0), scene.device)
+        primary = seconds(partial(run, 0), scene.device)
         share = float(hits.numpy().mean())
-        both, both_spread = seconds(partial(run, SHADOW_RAYS), scene.device)
+        both = seconds(partial(run, SHADOW_RAYS), scene.device)
         shadow_count = share * SIDE * SIDE * SHADOW_RAYS
         report(
             {
@@ -100,7 +100,6 @@ def main() -> None:
                 "hit_share": round(share, 3),
                 "primary_mrays_per_s": round(SIDE * SIDE / primary / 1e6, 2),
                 "shadow_mrays_per_s": round(shadow_count / (both - primary) / 1e6, 2),
-                "spread_s": [primary_spread, both_spread],
                 **context(scene.device, renderer.threads),
             },
             options.json,

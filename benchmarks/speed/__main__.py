@@ -193,14 +193,7 @@ def _part(runs: Runs, part: str) -> dict[str, float]:
         "seconds_step": float(np.median(runs.seconds_step)),
         **runs.errors(part),
         "runs": len(runs.seconds_step),
-        "seconds_step_spread": _spread(runs.seconds_step),
     }
-
-
-def _spread(seconds: Sequence[float]) -> float:
-    """Half the interquartile range."""
-    low, high = np.percentile(seconds, [25, 75])
-    return float(0.5 * (high - low))
 
 
 def _sweep_rows(
@@ -232,7 +225,6 @@ def _transport_row(settings: dict[str, Any], runs: Runs) -> dict[str, Any]:
         "settings": settings,
         "seconds_forward": float(np.median(runs.seconds_forward)),
         "seconds_step": float(np.median(runs.seconds_step)),
-        "seconds_step_spread": _spread(runs.seconds_step),
         "seconds_traced": float(np.median(runs.seconds_traced)),
         **{key: combined(*(errors[part][key] for part in PARTS)) for key in ERRORS},
         "peak_mib": round(runs.peak_mib, 1),

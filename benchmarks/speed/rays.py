@@ -69,7 +69,7 @@ def main() -> None:
             for tree, mesh in trees.items():
                 hits = wp.zeros(RAYS, dtype=int, device=device)
                 inputs = [mesh, *arrays, hits]
-                spent, _ = seconds(partial(wp.launch, kernel, RAYS, inputs, device=device), device)
+                spent = seconds(partial(wp.launch, kernel, RAYS, inputs, device=device), device)
                 rate, share = RAYS / spent / 1e6, hits.numpy().mean()
                 print(f"{where:8} {kind:8} {tree:7} {rate:7.1f} M/s, {share:.3f} hit")
 
