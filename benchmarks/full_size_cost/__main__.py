@@ -45,7 +45,7 @@ AUTHORS = InsertConfig(
 )  # fmt: skip
 """What the authors' run does; neither detail, files for other tools nor a report are theirs."""
 TINY = AUTHORS.changed(
- class_images=2, class_steps=2, lora_steps=4, steps=8, guidance_width=32, lobes=8,
+    class_images=2, class_steps=2, lora_steps=4, steps=8, guidance_width=32, lobes=8,
     light_height=16, object_light_height=8, score_every=4, width=48, samples=2,
 )  # fmt: skip
 EXTRA_STAGES = ("class images", "encoding", "evaluation", "training")
@@ -106,7 +106,7 @@ def _what_ran(
     config: InsertConfig, prior: StableDiffusion, loop: LightOptimization
 ) -> dict[str, Any]:
     """Return precision, size and settings of a run's networks and loop."""
-    adapter, noises = config.adapter, loop.guide.settings.noises
+    adapter = config.adapter
     is_cuda = prior.device.type == "cuda"
     return {
         "dtype": {
@@ -118,12 +118,6 @@ def _what_ran(
         "parameters": {
             "unet": sum(p.numel() for n, p in prior.unet.named_parameters() if ".lora_" not in n),
             "vae": sum(p.numel() for p in prior.vae.parameters()),
-        },
-        "batch": {
-            "class_images": 2 * adapter.class_batch,
-            "lora": 1 + adapter.lora_class_batch,
-            "unet": len(loop.guide.terms) * noises,
-            "vae": noises,
         },
         "settings": {
             "class_images": adapter.class_images,

@@ -38,7 +38,7 @@ from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.shadow.pilot import shaded_pixels
 from warpir.render.tone_curve import Knots, ToneCurve
 from warpir.scene.asset import Asset
-from warpir.scene.light import Light, angles_from_axis
+from warpir.scene.light import Light
 from warpir.scene.placement import place_asset
 
 MEASURE_HEIGHT = 128
@@ -270,12 +270,7 @@ def measure(truth: Truth, loop: LightOptimization) -> dict[str, Any]:
         "rmse": rms(error),
         "rmse_changed": rms(error[:, changed]),
         "tone_rmse": rms(curves),
-        "direction_deg": angles_from_axis(axis),
-        "true_direction_deg": angles_from_axis(true_axis),
-        "sun_sky": ratios[0],
         "true_sun_sky": ratios[1],
-        "retraced": loop.retraced,
-        "step": loop.state.best_step,
     }
 
 
@@ -386,7 +381,6 @@ def main() -> None:
         "settings": asdict(settings),
         "scenes": lines,
         "max_angle_deg": max(line["angle_deg"] for line in lines),
-        "max_sun_sky_log_error": max(line["sun_sky_log_error"] for line in lines),
     }
     write_json(options.json, record)
     if options.markdown is not None:

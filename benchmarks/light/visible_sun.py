@@ -104,8 +104,8 @@ def truth_of(path: Path) -> Truth:
     texels = resize_map(np.maximum(read_envmap(path), 0.0), 512)
     height, width = texels.shape[:2]
     directions = map_directions(height, width)
-    flux = luminance(texels.astype(np.float64)) * texel_solid_angles(height, width)[:, None]
     lum = luminance(texels.astype(np.float64))
+    flux = lum * texel_solid_angles(height, width)[:, None]
     near = directions @ directions[np.unravel_index(lum.argmax(), lum.shape)] > np.cos(0.05)
     axis = flux[near] @ directions[near]
     axis /= np.linalg.norm(axis)
