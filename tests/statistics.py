@@ -8,10 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike
 from scipy import stats
-from warp import autograd
 
 from tests.oracles import gauss_legendre
 from warpir.core.arrays import Float64Array
@@ -247,18 +245,3 @@ def central_differences(
         minus[index] -= step[index]
         gradient[index] = (function(plus) - function(minus)) / (plus[index] - minus[index])
     return gradient
-
-
-def warp_agrees(kernel: wp.Kernel, inputs: list[object], out: wp.array) -> bool:
-    """Return whether Warp's own central differences, in float32, agree with a kernel's adjoint."""
-    return autograd.gradcheck(
-        kernel,
-        dim=out.shape,
-        inputs=inputs,
-        outputs=[out],
-        device=out.device,
-        eps=3e-3,
-        atol=5e-3,
-        raise_exception=False,
-        show_summary=False,
-    )

@@ -1,5 +1,6 @@
 """glTF's material extensions in the BRDF: values, sampling, energy, gradients, sheen's table."""
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -8,28 +9,17 @@ import warp as wp
 
 from benchmarks.stability.case import download, launch, upload
 from tests import oracles as o
-from tests.kernels.test_brdf import (
-    GRADIENT_RELATIVE_L2,
-    VALUE_ATOL,
-    VALUE_RTOL,
-    Z_MAX,
-    outgoing,
-    random_case,
-    row_gradients,
-)
+from tests.kernels.test_brdf import VALUE_ATOL, VALUE_RTOL, Z_MAX, Case, outgoing, random_case
 from tests.oracles import LayeredMaterial
 from tests.statistics import chi_square, compare_gradients
-from warpir.kernels.bsdf import (
-    bsdf_f,
-    bsdf_of,
-    bsdf_sample,
-    layers_toward,
-)
+from warpir.kernels.bsdf import bsdf_f, bsdf_of, bsdf_sample, layers_toward
 from warpir.kernels.maths.fresnel import film_fresnel
 from warpir.kernels.types import Extensions, Layers
 from warpir.scene.sheen import TABLE_SIZE, sheen_albedo_table
 
 SAMPLE_COUNT = 50_000
+GRADIENT_RELATIVE_L2 = 1e-3
+"""float32 adjoint against central differences of the float64 oracle."""
 TABLE_ERROR, TABLE_ERROR_ROUGH = 0.02, 0.004
 """Of the table read bilinearly, over all roughness and from 0.3 on, as its docstring states."""
 TILTED = (0.28, -0.1, float(np.sqrt(1 - 0.28**2 - 0.1**2)))
@@ -51,6 +41,7 @@ MATERIALS = {
 }  # fmt: skip
 COS_O = float((29 / (TABLE_SIZE - 1)) ** 4)
 """A node of the sheen's table, so that reading it adds no error; 0.77."""
+WO = outgoing(COS_O, 0.4)
 
 
 @wp.func
@@ -84,23 +75,23 @@ def layers_of(
 
 @wp.kernel
 def eval_kernel(
-    wo: wp.vec3,
+    wo: wp.array[wp.vec3],
     wi: wp.array[wp.vec3],
+    base_color: wp.array[wp.vec3],
+    metallic: wp.array[float],
+    roughness: wp.array[float],
     e: wp.array[Extensions],
     coat_n: wp.vec3,
     transmitted: float,
     table: wp.array2d[float],
-    base_color: wp.array[wp.vec3],
-    metallic: wp.array[float],
-    roughness: wp.array[float],
     diffuse: wp.array[wp.vec3],
     specular: wp.array[wp.vec3],
     pdf: wp.array[float],
     p: wp.array[wp.vec2],
 ):
     i = wp.tid()
-    layers = layers_of(wo, e, coat_n, transmitted, table)
-    bsdf = bsdf_of(wo, base_color[i], metallic[i], roughness[i], layers)
+    layers = layers_of(wo[i], e, coat_n, transmitted, table)
+    bsdf = bsdf_of(wo[i], base_color[i], metallic[i], roughness[i], layers)
     value = bsdf_f(bsdf, wi[i])
     diffuse[i] = value.diffuse
     specular[i] = value.specular
@@ -142,8 +133,8 @@ def extensions(layers: LayeredMaterial, device: str) -> wp.array:
     return wp.array([e], dtype=Extensions, device=device)
 
 
-class Rows:
-    """One direction toward the camera, many toward the light, a base material for each."""
+class Rows(Case):
+    """Rows with layers, seen from one direction; a share ``transmitted`` of the rays passes."""
 
     def __init__(
         self,
@@ -152,37 +143,25 @@ class Rows:
         base_color: np.typing.ArrayLike = 0.5,
         metallic: np.typing.ArrayLike = 0.0,
         roughness: np.typing.ArrayLike = 0.5,
-        wo: np.ndarray | None = None,
-        transmitted: float = 0.0,
+        wo: np.ndarray = WO,
     ) -> None:
-        self.layers, self.transmitted = layers, transmitted
-        self.wo = outgoing(COS_O, 0.4) if wo is None else wo
-        self.wi = np.asarray(wi, np.float32)
-        count = len(self.wi)
-        self.base_color = np.broadcast_to(np.asarray(base_color, np.float32), (count, 3))
-        self.metallic = np.broadcast_to(np.asarray(metallic, np.float32), (count,))
-        self.roughness = np.broadcast_to(np.asarray(roughness, np.float32), (count,))
+        super().__init__(wo, wi, base_color, metallic, roughness)
+        self.layers, self.transmitted = layers, 0.0
 
     def launch(self, device: str, free: bool = False) -> tuple[list[wp.array], list[wp.array]]:
         """Return base colour, metallic and roughness, and value, density and probabilities."""
-        factors = [
-            upload(self.base_color, wp.vec3, device, free),
-            upload(self.metallic, float, device, free),
-            upload(self.roughness, float, device, free),
-        ]
+        arrays = self.arrays(device, free)
         kinds = (wp.vec3, wp.vec3, float, wp.vec2)
         out = [wp.zeros(len(self.wi), dtype=k, device=device, requires_grad=free) for k in kinds]
         inputs = [
-            wp.vec3(*map(float, self.wo)),
-            upload(self.wi, wp.vec3, device),
+            *arrays,
             extensions(self.layers, device),
             wp.vec3(*self.layers.coat_n),
             self.transmitted,
             upload(sheen_albedo_table(), float, device),
-            *factors,
         ]
         wp.launch(eval_kernel, len(self.wi), inputs=inputs, outputs=out, device=device)
-        return factors, out
+        return arrays[2:], out
 
     def evaluate(self, device: str) -> list[np.ndarray]:
         """Return diffuse, specular, density and lobe probabilities."""
@@ -191,21 +170,20 @@ class Rows:
     def oracle(self) -> np.ndarray:
         """Return the specifications' value, shape [row, 3]."""
         base, coat = o.layered_brdf(
-            self.wo, self.wi, self.base_color, self.metallic, self.roughness, self.layers
+            self.wo[0], self.wi, self.base_color, self.metallic, self.roughness, self.layers
         )
         return base + coat
 
 
 def random_rows(layers: LayeredMaterial, rng: np.random.Generator, count: int = 4000) -> Rows:
     case = random_case(rng, count, cos_min=0.01)
-    rows = Rows(layers, case.wi, case.base_color, case.metallic, case.roughness)
     # A third near the mirror direction of either normal
     for part, n in ((slice(0, count // 3), (0.0, 0.0, 1.0)), (slice(count // 3, None, 3), TILTED)):
-        mirror = 2.0 * (rows.wo @ np.asarray(n)) * np.asarray(n) - rows.wo
-        near = mirror + 0.1 * rng.normal(size=rows.wi[part].shape)
+        mirror = 2.0 * (WO @ np.asarray(n)) * np.asarray(n) - WO
+        near = mirror + 0.1 * rng.normal(size=case.wi[part].shape)
         near[:, 2] = np.maximum(np.abs(near[:, 2]), 0.01)
-        rows.wi[part] = o.normalize(near)
-    return rows
+        case.wi[part] = o.normalize(near)
+    return Rows(layers, case.wi, case.base_color, case.metallic, case.roughness)
 
 
 @pytest.mark.parametrize("name", MATERIALS)
@@ -424,20 +402,25 @@ def test_sheen_sample_weights_stay_bounded(device: str, rng: np.random.Generator
     """Cosine samples estimate the sheen's albedo without fireflies at usual roughness."""
     cloth = LayeredMaterial(specular=0.0, sheen_color=(1.0,) * 3, sheen_roughness=0.5)
     u = rng.random((20000, 2))
-    wi = np.stack(
-        [
-            np.sqrt(u[:, 0]) * np.cos(6.2831853 * u[:, 1]),
-            np.sqrt(u[:, 0]) * np.sin(6.2831853 * u[:, 1]),
-            np.sqrt(1.0 - u[:, 0]),
-        ],
-        axis=-1,
-    )
+    wi = o.spherical(np.sqrt(1.0 - u[:, 0]), 2.0 * np.pi * u[:, 1])
     rows = Rows(cloth, wi, 0.0, 0.0, 0.5, outgoing(0.3))
     diffuse, _, pdf, _ = rows.evaluate(device)
     weight = diffuse[:, 1] * wi[:, 2] / np.maximum(wi[:, 2] / np.pi, 1e-9)
     error = float(weight.std()) / np.sqrt(len(weight))
     assert weight.mean() == pytest.approx(o.sheen_albedo(0.3, 0.5), abs=Z_MAX * error)
     assert np.all(pdf > 0.0) and weight.max() < 10.0
+
+
+def row_gradients(
+    loss: Callable[..., np.ndarray], factors: dict[str, np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Yield central differences of each row's loss by its own value of each factor."""
+    h = 1e-5
+    for name, value in factors.items():
+        value = value.astype(np.float64)
+        steps = h * (np.eye(3) if value.ndim == 2 else np.ones(1))
+        columns = [loss(**{name: value + s}) - loss(**{name: value - s}) for s in steps]
+        yield np.stack(columns, axis=-1).reshape(value.shape) / (2 * h)
 
 
 @pytest.mark.parametrize("name", ["coat", "brushed", "film", "all"])
@@ -454,7 +437,7 @@ def test_layers_gradient(device: str, rng: np.random.Generator, name: str) -> No
     plain = {name: getattr(rows, name) for name in ("base_color", "metallic", "roughness")}
 
     def loss(**moved: np.ndarray) -> np.ndarray:
-        base, coat = o.layered_brdf(rows.wo, rows.wi, layers=rows.layers, **{**plain, **moved})
+        base, coat = o.layered_brdf(rows.wo[0], rows.wi, layers=rows.layers, **{**plain, **moved})
         return np.asarray(np.sum((base + coat) * y, axis=1))
 
     for array, expected in zip(factors, row_gradients(loss, plain), strict=True):

@@ -7,7 +7,6 @@ import warp as wp
 from benchmarks.stability.case import differentiate, launch, upload
 from benchmarks.stability.tone import reinhard_kernel
 from tests import oracles as o
-from tests.statistics import central_differences, compare_gradients, warp_agrees
 from warpir.kernels.tone import ratio_curve, tone_curve
 
 VALUE_ABS = 1e-6
@@ -63,13 +62,6 @@ def float32_knots(raw: np.ndarray) -> tuple[np.ndarray, ...]:
     return x, y, slope
 
 
-def test_identity_curve(device: str) -> None:
-    """Zero parameters leave every value alone; values outside [0, 1] are clamped."""
-    x = np.concatenate([np.linspace(0.0, 1.0, 1001), [-1.0, -1e-9, 1.0 + 1e-6, 5.0, 1e30]])
-    y = apply_curve(x, np.zeros(len(x)), float32_knots(np.zeros((1, 16))), device)
-    np.testing.assert_allclose(y, np.clip(x, 0.0, 1.0), atol=2e-7)
-
-
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
 def test_curve_matches_oracle(device: str, rng: np.random.Generator, scale: float) -> None:
     """Three curves of random parameters equal the spline of Durkan 2019, eq. 4."""
@@ -121,55 +113,6 @@ def curve_gradients(
     index = wp.array(np.asarray(curve, np.int32), dtype=int, device=device)
     inputs = [arrays[0], index, *arrays[1:], knots[0].shape[1] - 1]
     return differentiate(curve_kernel, inputs, y, float, device=device)[1]
-
-
-def test_curve_gradient(device: str, rng: np.random.Generator) -> None:
-    """Adjoints of ``x`` and of all knots against central differences; ``f'`` is eq. 5."""
-    knots = float32_knots(rng.normal(scale=0.8, size=(3, 16)))
-    x = rng.uniform(0.01, 0.99, 600).astype(np.float32)
-    curve = rng.integers(0, 3, 600)
-    y = rng.normal(size=600).astype(np.float32)
-    gradients = curve_gradients(x, curve, knots, y, device)
-
-    def loss(knot_x: np.ndarray, knot_y: np.ndarray, slope: np.ndarray) -> float:
-        return sum(
-            float(y[curve == c] @ o.spline(x[curve == c], knot_x[c], knot_y[c], slope[c])[0])
-            for c in range(3)
-        )
-
-    wide = [k.astype(np.float64) for k in knots]
-    slope_at = np.empty(600)
-    for c in range(3):
-        slope_at[curve == c] = o.spline(x[curve == c], *(k[c] for k in wide))[1]
-    expected = [y * slope_at]
-    for k in range(3):
-        moved = lambda a, k=k: loss(*[a if i == k else w for i, w in enumerate(wide)])  # noqa: E731
-        expected.append(central_differences(moved, wide[k], 1e-7))
-    # The outermost x knots are the ends of the interval, never free.
-    gradients[1], expected[1] = gradients[1][:, 1:-1], expected[1][:, 1:-1]
-    for gradient, reference in zip(gradients, expected, strict=True):
-        match = compare_gradients(gradient, reference)
-        assert match.relative_l2 < GRADIENT_RELATIVE_L2, match
-
-
-def test_curve_gradient_at_the_ends(device: str, rng: np.random.Generator) -> None:
-    """At 0 and 1 the gradient is finite; outside the interval it is 0 (the value is clamped)."""
-    knots = float32_knots(rng.normal(size=(1, 16)))
-    x = np.array([-0.5, 0.0, 1.0, 1.5])
-    d_x, *d_knots = curve_gradients(x, np.zeros(4), knots, np.ones(4), device)
-    assert np.all(np.isfinite(d_x)) and all(np.all(np.isfinite(d)) for d in d_knots)
-    assert d_x[0] == 0.0 and d_x[3] == 0.0
-
-
-def test_curve_gradcheck(device: str, rng: np.random.Generator) -> None:
-    """Warp's own finite differences agree with the adjoint."""
-    knots = float32_knots(rng.normal(scale=0.3, size=(1, 16)))
-    # Mid-bin, so that a step does not cross a knot.
-    x = 0.5 * (knots[0][0, 1:] + knots[0][0, :-1])
-    index = wp.zeros(5, dtype=int, device=device)
-    out = wp.zeros(5, dtype=float, device=device, requires_grad=True)
-    inputs = [floats(x, device, True), index, *(floats(k, device, True) for k in knots), 5]
-    assert warp_agrees(curve_kernel, inputs, out)
 
 
 def test_ratio_curve_goes_on_straight(device: str, rng: np.random.Generator) -> None:
