@@ -7,15 +7,12 @@ import pytest
 import warp as wp
 
 from benchmarks.stability.case import launch, upload
+from benchmarks.stability.lobes import sample_kernel as lobe_kernel
 from benchmarks.stability.maps import eval_kernel, sample_kernel
 from tests import oracles as o
 from tests.statistics import ChiSquare, chi_square, graded_edges
 from warpir.kernels.maths.frame import basis, to_local, to_world
-from warpir.kernels.sampling import (
-    cosine_sample,
-    lobe_sample,
-    power_heuristic,
-)
+from warpir.kernels.sampling import cosine_sample, power_heuristic
 from warpir.kernels.types import LightArgs
 from warpir.render.device_light import PlaneLight, light_args
 from warpir.scene.light import Light, Lobes, fibonacci
@@ -59,12 +56,6 @@ def heuristic_kernel(a: wp.array[float], b: wp.array[float], weight: wp.array[fl
 def cosine_kernel(u: wp.array[wp.vec2], wi: wp.array[wp.vec3]):
     i = wp.tid()
     wi[i] = cosine_sample(u[i])
-
-
-@wp.kernel
-def lobe_kernel(u: wp.array[wp.vec2], axis: wp.vec3, sharpness: float, wi: wp.array[wp.vec3]):
-    i = wp.tid()
-    wi[i] = lobe_sample(u[i], axis, sharpness)
 
 
 def heuristic(a: np.ndarray, b: np.ndarray, device: str) -> np.ndarray:

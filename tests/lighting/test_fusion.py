@@ -1,11 +1,13 @@
-"""Fusion of two lights: the typeset equations, derived identities, gradients, black maps."""
+"""Fusion of two lights: the typeset equations, their ends, black maps.
+
+Gradients, lights far apart and black lights are among the hard cases of `benchmarks.stability`.
+"""
 
 import numpy as np
 import pytest
 import torch
 
 from tests import oracles as o
-from tests.statistics import central_differences, compare_gradients
 from warpir.core.arrays import Float64Array
 from warpir.lighting.fusion import fuse, fused_light
 
@@ -13,10 +15,6 @@ FLOAT64 = 1e-12
 """About ten float64 operations, relative."""
 FLOAT32 = 2e-6
 """About ten float32 operations, relative to the brighter light."""
-GRADIENT_RELATIVE_L2 = 1e-7
-"""Central differences in float64, steps of 1e-5: 3e-8 of round-off, 1e-10 of curvature."""
-FACTOR_MIN = 2.0 * np.sqrt(2.0) - 2.0
-"""Least value of ``1 + S (S - F) / (M (F + S))``, at ``F = M`` and ``S = (sqrt 2 - 1) F``."""
 
 
 def maps(rng: np.random.Generator, height: int = 4, width: int = 6) -> tuple[Float64Array, ...]:
@@ -28,14 +26,6 @@ def maps(rng: np.random.Generator, height: int = 4, width: int = 6) -> tuple[Flo
 def run(fg: Float64Array, shadow: Float64Array, scale: float) -> tuple[Float64Array, ...]:
     first, second = fuse(torch.tensor(fg), torch.tensor(shadow), scale)
     return first.numpy(), second.numpy()
-
-
-def test_fused_light_is_the_typeset_equation(rng: np.random.Generator) -> None:
-    """Where the printed form is defined, the division-free one equals it (S 1-3)."""
-    for _ in range(5):
-        fg, shadow = maps(rng)
-        fused = fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy()
-        np.testing.assert_allclose(fused, o.fuse_literal(fg, shadow), rtol=FLOAT64)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.25, 0.5, 1.0])
@@ -61,72 +51,10 @@ def test_scale_zero_separates_and_scale_one_unites(rng: np.random.Generator) -> 
     np.testing.assert_array_equal(one[0], one[1])
 
 
-def test_factor_has_its_lower_bound(rng: np.random.Generator) -> None:
-    """Fusion takes at most 17.2 % from a texel, and takes that much at ``S = (sqrt 2 - 1) F``."""
-    grey = np.ones(3)
-    fg = np.ones((64, 128, 1)) * grey
-    shadow = np.exp(rng.uniform(-20.0, 20.0, (64, 128, 1))) * grey
-    shadow[0, 0] = np.sqrt(2.0) - 1.0
-    factor = fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy() / fg
-    assert factor.min() >= FACTOR_MIN - FLOAT64
-    assert factor[0, 0, 0] == pytest.approx(FACTOR_MIN, rel=FLOAT64)
-    fg = np.exp(rng.uniform(-20.0, 20.0, (64, 128, 3)))
-    factor = fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy() / fg
-    assert factor.min() >= FACTOR_MIN - FLOAT64
-
-
-def test_brightest_texel_and_dark_texels(rng: np.random.Generator) -> None:
-    """At the peak ``(F^2 + S^2) / (F + S)``; toward ``F = 0`` it is ``F (1 + S / M)``."""
-    fg, shadow = maps(rng)
-    fused = o.luminance(fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy())
-    F, S = o.luminance(fg), o.luminance(shadow)
-    at = np.unravel_index(np.argmax(F), F.shape)
-    assert fused[at] == pytest.approx((F[at] ** 2 + S[at] ** 2) / (F[at] + S[at]), rel=FLOAT64)
-    fg[0, 0] = 1e-12
-    fused = o.luminance(fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy())
-    peak = o.luminance(fg).max()
-    assert fused[0, 0] == pytest.approx(1e-12 * (1.0 + S[0, 0] / peak), rel=1e-8)
-
-
-def test_equal_lights_and_chroma_stay(rng: np.random.Generator) -> None:
-    """Equal maps fuse to themselves, and the fused chroma is always the foreground's."""
-    fg, shadow = maps(rng)
+def test_equal_lights_stay(rng: np.random.Generator) -> None:
+    """Equal maps fuse to themselves."""
+    fg, _ = maps(rng)
     np.testing.assert_array_equal(fused_light(torch.tensor(fg), torch.tensor(fg)).numpy(), fg)
-    fused = fused_light(torch.tensor(fg), torch.tensor(shadow)).numpy()
-    chroma = [x / x.sum(axis=-1, keepdims=True) for x in (fused, fg)]
-    np.testing.assert_allclose(chroma[0], chroma[1], rtol=FLOAT64)
-
-
-def test_fusion_scales_with_both_lights(rng: np.random.Generator) -> None:
-    """``fuse(a L) = a fuse(L)``: there is no absolute unit."""
-    fg, shadow = maps(rng)
-    for factor in (1e-20, 1e20):
-        for scaled, plain in zip(
-            run(factor * fg, factor * shadow, 0.4), run(fg, shadow, 0.4), strict=True
-        ):
-            np.testing.assert_allclose(scaled, factor * plain, rtol=FLOAT64)
-
-
-@pytest.mark.parametrize("scale", [0.0, 0.3, 1.0])
-def test_gradient_against_central_differences(rng: np.random.Generator, scale: float) -> None:
-    """Both primed maps, by both given maps, the brightest texel's part included."""
-    fg, shadow = maps(rng, 3, 4)
-    y = rng.normal(size=(2, *fg.shape))
-
-    def loss(a: Float64Array, b: Float64Array) -> float:
-        return float(sum(np.sum(w * x) for w, x in zip(y, o.fuse(a, b, scale), strict=True)))
-
-    tensors = [torch.tensor(x, requires_grad=True) for x in (fg, shadow)]
-    found = fuse(*tensors, scale)
-    sum((torch.tensor(w) * x).sum() for w, x in zip(y, found, strict=True)).backward()
-    expected = [
-        central_differences(lambda a: loss(a, shadow), fg, 1e-5 * fg),
-        central_differences(lambda b: loss(fg, b), shadow, 1e-5 * shadow),
-    ]
-    for tensor, truth in zip(tensors, expected, strict=True):
-        assert tensor.grad is not None
-        match = compare_gradients(tensor.grad.numpy(), truth)
-        assert match.relative_l2 < GRADIENT_RELATIVE_L2, match
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -63,23 +63,6 @@ def test_consistency_of_equal_shapes_is_zero(rng: np.random.Generator) -> None:
         assert abs(float(consistency(factor * shape, shape))) < FLOAT64
 
 
-def test_consistency_sees_luminance_alone(rng: np.random.Generator) -> None:
-    """Red light of the same luminance everywhere is the same light."""
-    grey = torch.from_numpy(maps(rng)[0][..., :1]).expand(-1, -1, 3)
-    red = torch.zeros_like(grey)
-    red[..., 0] = grey[..., 0] / 0.2126
-    assert abs(float(consistency(red, grey))) < FLOAT64
-
-
-@pytest.mark.parametrize(("fg", "shadow"), [(0.5, 0.5), (0.25, 0.5), (0.5, 0.1), (0.9, 0.2)])
-def test_consistency_of_two_texels_by_hand(fg: float, shadow: float) -> None:
-    """``p log(p / q) + (1 - p) log((1 - p) / (1 - q))`` for shares p and q of the flux."""
-    p, q = shadow, fg
-    expected = p * np.log(p / q) + (1.0 - p) * np.log((1.0 - p) / (1.0 - q))
-    found = consistency(two_texels(q, 1.0 - q), two_texels(7.0 * p, 7.0 * (1.0 - p)))
-    assert float(found) == pytest.approx(expected, rel=FLOOR, abs=1e-9)
-
-
 def test_consistency_of_a_dark_foreground_is_its_floor() -> None:
     """All light in a half that the foreground leaves black: ``log((1 / 2 pi) / 1e-8)``."""
     found = consistency(two_texels(1.0, 0.0), two_texels(0.0, 1.0))
@@ -112,40 +95,9 @@ def test_consistency_pulls_the_foreground_alone(rng: np.random.Generator) -> Non
 # -------------------------------------------------------------------------------- spread
 
 
-def test_spread_of_an_even_light() -> None:
-    """``L = 1`` everywhere is ``12 pi ln 3`` (eq. 11: three channels over the sphere)."""
-    for height in (1, 6, 32):
-        texels = torch.ones(height, 2 * height, 3, dtype=torch.float64)
-        assert float(spread(texels)) == pytest.approx(12.0 * np.pi * np.log(3.0), rel=FLOAT64)
-
-
 def test_spread_is_the_papers(rng: np.random.Generator) -> None:
     for texels in maps(rng):
         assert float(spread(torch.from_numpy(texels))) == pytest.approx(o.cauchy(texels), rel=1e-12)
-
-
-def test_spread_prefers_few_directions() -> None:
-    """Flux in fewer texels costs less: ``3 n dOmega log(1 + 2 (16 / n)^2)`` falls with n."""
-    height, costs = 8, []
-    omega = o.texel_solid_angle(height, 2 * height)[3]
-    for count in (16, 4, 1):
-        texels = torch.zeros(height, 2 * height, 3, dtype=torch.float64)
-        texels[3, :count] = 16.0 / count
-        costs.append(float(spread(texels)))
-        expected = 3.0 * count * omega * np.log(1.0 + 2.0 * (16.0 / count) ** 2)
-        assert costs[-1] == pytest.approx(expected, rel=FLOAT64)
-    assert costs[0] > costs[1] > costs[2]
-
-
-def test_spread_gradient_against_central_differences(rng: np.random.Generator) -> None:
-    texels, _ = maps(rng, 3)
-    tensor = torch.tensor(texels, requires_grad=True)
-    (gradient,) = torch.autograd.grad(spread(tensor), tensor)
-    expected = central_differences(
-        lambda m: float(spread(torch.from_numpy(m))), texels, 1e-5 * texels
-    )
-    match = compare_gradients(gradient.numpy(), expected)
-    assert match.relative_l2 < 1e-7, match
 
 
 # -------------------------------------------------------------------------------- chroma

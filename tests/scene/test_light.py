@@ -30,7 +30,6 @@ from warpir.scene.light import (
     as_file_map,
     as_map,
     axis_from_angles,
-    lobe_cosine,
     plain_sky,
     rasterize_lobes,
     summarize,
@@ -181,16 +180,6 @@ def test_as_map_keeps_the_flux_of_lobes(height: int, sharpness: float) -> None:
         np.testing.assert_allclose(found, np.array([3, 2, 1]) * sg_flux(sharpness), rtol=0.02)
 
 
-@pytest.mark.parametrize("sharpness", [1.0, 60.0, 1e3, 6e3, 6.6e3, 7e3])
-def test_as_map_keeps_the_power_at_a_pole(sharpness: float) -> None:
-    """A lobe straight above, just not narrow enough for a single texel, keeps it within 1 %.
-
-    Midpoints in latitude gave it 4 % too much: the integrand starts at the pole with a slope.
-    """
-    found = flux(as_map(lobe(UP, sharpness), 64))
-    np.testing.assert_allclose(found, np.ones(3) * sg_flux(sharpness), rtol=0.01)
-
-
 def test_as_map_adds_lobes_and_map() -> None:
     """The whole light is the sum; a map alone is resampled, at its own size untouched."""
     light = Light(lobe((0.2, 0.9, 0.1), 20.0).lobes, noise_map(16))
@@ -223,11 +212,9 @@ def test_rasterized_lobes_are_means_over_each_texel() -> None:
 @pytest.mark.parametrize("sharpness", [0.1, 1.0, 10.0, 300.0, 1.85e5])
 @pytest.mark.parametrize("elevation", [90.0, 40.0, 3.0, 0.0, -20.0])
 def test_lobe_irradiance_matches_quadrature(sharpness: float, elevation: float) -> None:
-    """The mean clamped cosine of a lobe is its irradiance over its flux, above and below."""
+    """Irradiance over flux is the mean clamped cosine of a lobe, above and below."""
     axis = axis_from_angles(70.0, elevation)
-    cosine = lobe_cosine(float(axis @ UP), sharpness)
     expected = sg_irradiance(UP, axis, sharpness) / sg_flux(sharpness)
-    assert cosine == pytest.approx(float(expected), rel=QUADRATURE, abs=1e-5)
     light = lobe(axis, sharpness, (1.0, 2.0, 3.0))
     found = light.irradiance(UP) / (np.array([1, 2, 3]) * sg_flux(sharpness))
     np.testing.assert_allclose(found, expected, rtol=QUADRATURE, atol=1e-5)
