@@ -1,6 +1,5 @@
 """Class images and prompts: worded well, made once, found again, whatever the batch."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,6 @@ from torch import Tensor
 
 import warpir.diffusion.personalization.class_images as module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
-from warpir.core.atomic import write_file
-from warpir.core.cache import make_room
 from warpir.diffusion.cache import content_key, model_key
 from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.stable_diffusion import StableDiffusion
@@ -293,16 +290,6 @@ def test_latents_are_the_encoded_images(prior: StableDiffusion) -> None:
 
 
 # The cache
-
-
-def test_the_longest_unused_files_make_room(tmp_path: Path) -> None:
-    for place in range(4):
-        write_file(tmp_path / f"{place}.png", bytes(10))
-        os.utime(tmp_path / f"{place}.png", (place, place))
-    write_file(tmp_path / "other.txt", bytes(1000))
-    os.utime(tmp_path / "0.png", (9, 9))
-    make_room(tmp_path.glob("*.png"), limit=25)
-    assert sorted(os.listdir(tmp_path)) == ["0.png", "3.png", "other.txt"]
 
 
 def test_keys_tell_contents_apart() -> None:

@@ -302,20 +302,6 @@ def test_sds_is_the_score_of_the_noised_density(rng: np.random.Generator, t: flo
     assert expected.norm() / math.sqrt(x.numel()) > 10 * standard_error
 
 
-@pytest.mark.parametrize("loss", ["lds", "lds-lora-both"])
-def test_zero_adapter_makes_lds_equal_csd(rng: np.random.Generator, loss: str) -> None:
-    """With an adapter that adds nothing and one prompt, LDS is CSD bit for bit."""
-    found = []
-    for name in (loss, "csd"):
-        settings = GuidanceSettings(loss=name, noises=2)
-        prior = GaussianPrior(adapter_shift=0.0)
-        found.append(Guidance(prior, PROMPT, settings, MASK, 100, 3, "scene"))
-    for step in (0, 50, 99):
-        x = picture(rng).float()
-        first, second = (made.gradient(x, step) for made in found)
-        assert first is not None and second is not None and torch.equal(first, second)
-
-
 @pytest.mark.parametrize("literal_alpha", [False, True])
 @pytest.mark.parametrize("name", ["sigma2", "sigma", "uniform"])
 def test_weight_scales_the_gradient(
@@ -803,32 +789,6 @@ def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folde
         assert score is not None and score == each.score(x)
         if isinstance(each, Guidance):
             assert each.ensure_precision(x) == 1.0
-
-
-def test_batch_of_terms_and_noises_equals_separate_calls(
-    rng: np.random.Generator, folder: Path
-) -> None:
-    """One sample at a time, the UNet predicts what it predicts in one batch."""
-    x, mask = photo(rng)
-    prior = load_adapted(folder, 0.5)
-    settings = replace(SD_SETTINGS, loss="sds", guidance_scale=7.5)
-    made = Guidance(prior, PROMPT, settings, mask, 10, 3, "scene")
-    together = made.gradient(x, 4)
-    predict = prior.predict
-    sizes = []
-
-    def one_by_one(
-        z: Tensor, t: Tensor, e: Tensor, adapters: Sequence[str | None], *_: None
-    ) -> Tensor:
-        sizes.append(len(z))
-        parts = [slice(i, i + 1) for i in range(len(z))]
-        return torch.cat([predict(z[p], t[p], e[p], adapters[p]) for p in parts])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prior, "predict", one_by_one)
-        separate = made.gradient(x, 4)
-    assert sizes == [4] and together is not None and separate is not None
-    assert compare_gradients(separate, together).relative_l2 < 2e-5  # float32, g = 7.5
 
 
 def test_gradient_and_score_fall_back_to_full_precision(rng: np.random.Generator) -> None:

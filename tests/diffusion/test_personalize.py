@@ -26,7 +26,6 @@ from warpir.diffusion.personalization.class_images import to_bytes
 from warpir.diffusion.personalization.lora_files import (
     Lora,
     initial_lora,
-    load_lora,
     lora_parameters,
     remove_lora,
     save_lora,
@@ -236,22 +235,21 @@ def test_losses_that_are_not_finite_end_the_run(epsilon: StableDiffusion) -> Non
     assert epsilon.adapters == set()
 
 
-def test_latents_that_are_not_finite_end_the_run(
-    epsilon: StableDiffusion, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("method", "wrong", "words"),
+    [
+        ("encode", lambda x: torch.full((len(x), 4, 8, 8), torch.inf), "latents"),
+        pytest.param(
+            "predict", lambda x, *_: x * torch.nan, "predictions", marks=pytest.mark.case("L7")
+        ),
+    ],
+)
+def test_networks_that_are_not_finite_end_the_run(
+    epsilon: StableDiffusion, monkeypatch: pytest.MonkeyPatch, method: str, wrong: Any, words: str
 ) -> None:
-    """As when half precision overflows in the autoencoder."""
-    monkeypatch.setattr(epsilon, "encode", lambda x: torch.full((len(x), 4, 8, 8), float("inf")))
-    with pytest.raises(NonFiniteError, match="latents are not finite"):
-        personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
-
-
-@pytest.mark.case("L7")
-def test_predictions_that_are_not_finite_end_the_run(
-    epsilon: StableDiffusion, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As when half precision overflows in the UNet; no file could hold their error."""
-    monkeypatch.setattr(epsilon, "predict", lambda x, *_: torch.full_like(x, float("nan")))
-    with pytest.raises(NonFiniteError, match="predictions are not finite"):
+    """As when half precision overflows; no file could hold the error of such predictions."""
+    monkeypatch.setattr(epsilon, method, wrong)
+    with pytest.raises(NonFiniteError, match=f"{words} are not finite"):
         personalize(epsilon, PHOTO, PROMPTS, SETTINGS, 0, None)
 
 
@@ -688,30 +686,3 @@ def test_the_model_is_shown_before_and_after(epsilon: StableDiffusion, tmp_path:
     again = show_personalization(*arguments, report=lambda stage, *_: told.append(stage))
     assert np.array_equal(again, sheet)
     assert set(told) == {"samples"}
-
-
-@pytest.mark.parametrize("place", [0, 1], ids=["diffusers", "kohya"])
-def test_saved_files_are_the_trained_adapter(
-    prior: StableDiffusion, folders: dict[str, Path], tmp_path: Path, place: int
-) -> None:
-    """In a fresh prior and in diffusers' pipeline, to the bit."""
-    from diffusers import StableDiffusionPipeline
-
-    made = personalize(prior, PHOTO, PROMPTS, SETTINGS, 0, None)
-    kind = prior.schedule.prediction_type
-    file = save_lora(made.lora, tmp_path, 32, kind, PROMPTS.photo)[place]
-    expected = predictions(prior, "scene")
-
-    fresh = load(folders[kind])
-    load_lora(fresh, file)
-    assert torch.equal(predictions(fresh, "scene"), expected)
-
-    pipeline = StableDiffusionPipeline.from_pretrained(
-        folders[kind], safety_checker=None, local_files_only=True
-    )
-    pipeline.load_lora_weights(tmp_path, weight_name=file.name, adapter_name="scene")
-    theirs = load(folders[kind])
-    theirs.unet = pipeline.unet
-    theirs.adapters.add("scene")
-    assert torch.equal(predictions(theirs, "scene"), expected)
-    assert not torch.equal(predictions(theirs, None), expected)

@@ -80,17 +80,6 @@ def test_schedule_predictions_satisfy_their_definitions() -> None:
         torch.testing.assert_close(found, expected[kind], rtol=0, atol=1e-6)
 
 
-def test_schedule_difference_of_v_is_scaled_difference_of_noise() -> None:
-    """e1 - e0 = a (v1 - v0), and -(a / s) (x1 - x0) for the clean sample."""
-    first, second = latents_and_noise(1)
-    noisy, t = torch.ones_like(first), torch.tensor([0.4])
-    a, s = schedule().alpha_sigma(t)
-    for kind, factor in (("v_prediction", a), ("sample", -a / s), ("epsilon", 1.0)):
-        it = schedule(kind)
-        found = it.to_noise(first, noisy, t) - it.to_noise(second, noisy, t)
-        torch.testing.assert_close(found, factor * (first - second), rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("prediction_type", PREDICTION_TYPES)
 def test_schedule_without_terminal_signal_is_finite_at_one(prediction_type: str) -> None:
     """Nothing is divided by a, which is 0 at the end of such a schedule."""
