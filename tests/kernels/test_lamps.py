@@ -112,20 +112,24 @@ def numbers(rng: np.random.Generator, count: int = SAMPLE_COUNT) -> np.ndarray:
     return np.minimum(np.hstack([pair, rng.random((len(pair), 1))]), 0.9999999)
 
 
-def quadrature(lamp: Lamp, p: np.ndarray, n: np.ndarray) -> float:
-    """Irradiance by radiance 1 from the lamp's surface, by midpoints."""
-    g = (np.arange(600) + 0.5) / 600
+def surface(lamp: Lamp, count: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Evenly spread points of a lamp's surface, ``count`` squared, their normals, and its area."""
+    g = (np.arange(count) + 0.5) / count
     if isinstance(lamp, RectangleLamp):
         s, t = (x.reshape(-1, 1) for x in np.meshgrid(g, g))
         q = lamp.corner + s * lamp.edge_x + t * lamp.edge_y
         m = np.cross(lamp.edge_x, lamp.edge_y)
-        area = np.linalg.norm(m)
-        m = np.broadcast_to(m / area, q.shape)
-    else:
-        z, phi = (x.reshape(-1) for x in np.meshgrid(2.0 * g - 1.0, 2.0 * np.pi * g))
-        r = np.sqrt(1.0 - z * z)
-        m = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-        q, area = lamp.center + lamp.radius * m, 4.0 * np.pi * lamp.radius**2
+        area = float(np.linalg.norm(m))
+        return q, np.broadcast_to(m / area, q.shape), area
+    z, phi = (x.reshape(-1) for x in np.meshgrid(2.0 * g - 1.0, 2.0 * np.pi * g))
+    r = np.sqrt(1.0 - z * z)
+    m = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+    return lamp.center + lamp.radius * m, m, 4.0 * np.pi * lamp.radius**2
+
+
+def quadrature(lamp: Lamp, p: np.ndarray, n: np.ndarray) -> float:
+    """Irradiance by radiance 1 from the lamp's surface, by midpoints."""
+    q, m, area = surface(lamp, 600)
     w = q - p
     d = np.linalg.norm(w, axis=1)
     cosines = np.maximum(w @ n / d, 0.0) * np.maximum(-(w * m).sum(axis=1) / d, 0.0)

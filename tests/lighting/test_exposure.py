@@ -1,6 +1,7 @@
 """The level of an estimated light: the regressor's word weighed against the ground's."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -141,28 +142,23 @@ def test_without_ground_in_view_the_regressor_decides() -> None:
     assert ask_ground(regression(), hidden) is None
 
 
-def test_ground_behind_the_occluder_mask_is_left_out() -> None:
-    """A dark post in front of the left half is no ground."""
+@pytest.mark.parametrize(
+    ("name", "mask_of", "dark"),
+    [("occluder", np.asarray, 0.01), ("shadow_mask", lambda m: ShadowMask(m, 0.0), 0.03)],
+)
+def test_ground_that_a_mask_marks_is_left_out(
+    name: str, mask_of: Callable[[FloatArray], object], dark: float
+) -> None:
+    """A dark post in front of the left half is no ground, nor is what --shadow-mask marks lit."""
     albedo = np.full((32, 48, 3), 0.3, np.float32)
-    albedo[:, :30] = 0.01
+    albedo[:, :30] = dark
     mask = np.zeros((32, 48), np.float32)
     mask[:, :30] = 1.0
     seen = inputs_of(albedo)
     fooled = ask_ground(regression(), seen)
-    masked = ask_ground(regression(), replace(seen, occluder=mask))
+    masked = ask_ground(regression(), replace(seen, **{name: mask_of(mask)}))
     assert fooled is not None and masked is not None
     assert fooled.implied < 0.05 and masked.implied == pytest.approx(0.3, rel=3e-3)
-
-
-def test_ground_in_a_known_shadow_is_left_out() -> None:
-    """What --shadow-mask marks is not measured, as the sun does not reach it."""
-    albedo = np.full((32, 48, 3), 0.3, np.float32)
-    albedo[:, :30] = 0.03
-    shares = np.zeros((32, 48), np.float32)
-    shares[:, :30] = 1.0
-    shaded = replace(inputs_of(albedo), shadow_mask=ShadowMask(shares, 0.0))
-    ground = ask_ground(regression(), shaded)
-    assert ground is not None and ground.implied == pytest.approx(0.3, rel=3e-3)
 
 
 def test_estimate_follows_the_ground_where_its_albedo_is_stated(

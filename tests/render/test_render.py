@@ -557,14 +557,19 @@ def card(material: Material, texture: Texture | None = None, uv: float = 1.0) ->
     return placed(quad((0, 0, -5.0), (1, 0, 0), (0, 1, 0), uv=uv), material, textures=textures)
 
 
-def roofed(device: str, *materials: Material, color: FloatArray | None = None) -> FloatArray:
+def roofed(
+    device: str,
+    *materials: Material,
+    color: FloatArray | None = None,
+    textures: tuple[Texture, ...] = (),
+) -> FloatArray:
     """Shadow ratio of a lone sun below one wide roof per material, above each other."""
     roofs = []
     for k in range(len(materials)):
         plain = quad((0, 1.0 + k, 0), (5.0, 0, 0), (0, 0, -5.0), k)
         roofs.append(replace(plain, colors=color))
-    renderer = make(placed(roofs, *materials), from_above(4, 4, 0.5), device, 0.0)
-    return shadow(renderer, OVERHEAD)[0]
+    thing = placed(roofs, *materials, textures=textures)
+    return shadow(make(thing, from_above(4, 4, 0.5), device, 0.0), OVERHEAD)[0]
 
 
 @pytest.mark.case("M19")
@@ -582,11 +587,7 @@ def test_M19_blend_lets_its_share_through(device: str) -> None:
     np.testing.assert_allclose(roofed(device, glass, glass), 0.5625, rtol=FLOAT32)
     opaque_texture = Texture(np.full((3, 5, 4), 255, np.uint8))
     still = Material(alpha_mode="BLEND", base_color_texture=TextureSlot(0))
-    textured = placed(
-        quad((0, 1.0, 0), (5.0, 0, 0), (0, 0, -5.0)), still, textures=(opaque_texture,)
-    )
-    ratio = shadow(make(textured, from_above(4, 4, 0.5), device, 0.0), OVERHEAD)[0]
-    np.testing.assert_array_equal(ratio, 0.0)
+    np.testing.assert_array_equal(roofed(device, still, textures=(opaque_texture,)), 0.0)
     half = np.full((4, 4), (1.0, 1.0, 1.0, 0.5), np.float32)
     np.testing.assert_allclose(roofed(device, glass, color=half), 0.875, rtol=FLOAT32)
 

@@ -9,16 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.builders.shapes import (
-    all_pixels,
-    box,
-    camera,
-    ground,
-    placed,
-    quad,
-    seen_ground,
-    sphere,
-)
+from tests.builders.shapes import all_pixels, ground, placed, quad, seen_ground, sphere
+from tests.render.near.test_lamps import COLOR, DOWN, LAMBERT, POWER, UP, VIEW, ball_beside_glow
 from warpir.core.arrays import Float64Array
 from warpir.render.device_scene import Placed, Scene
 from warpir.render.integrator import MaterialTensors, Radiance
@@ -35,11 +27,9 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import Light
 from warpir.scene.near.lamps import Lamp, RectangleLamp, SphereLamp, irradiance
 
-VIEW = camera(24, 16, 24.0, (0.0, 1.5, 4.0), pitch=-15.0)
 PIXELS = all_pixels(VIEW)
 ROWS = TransportSettings(height_fg=16, height_shadow=16, dtype="float32")
 SKY = torch.from_numpy(np.random.default_rng(4).uniform(0.1, 0.4, (16, 32, 3))).float()
-POWER = np.array([40.0, 30.0, 20.0])
 WITHIN = 0.02
 """Asked of a gradient."""
 
@@ -53,11 +43,7 @@ def lamps_of_both_kinds() -> list[Lamp]:
 
 
 def renderer(lamps: Sequence[Lamp], device: str) -> Renderer:
-    """A glossy ball beside a box that glows, which throw light on the ground."""
-    parts = [sphere((0.0, 0.6, 0.0), 0.5, 3), box((0.9, 0.3, 0.0), (0.4, 0.6, 0.4), 1)]
-    gloss = Material(base_color=(0.7, 0.7, 0.7), metallic=0.2, roughness=0.6)
-    glow = Material(base_color=(0.5, 0.5, 0.5), emission=(0.3, 0.2, 0.1))
-    scene = Scene([placed(parts, gloss, glow)], VIEW, ground(0.0), device, lamps)
+    scene = Scene([ball_beside_glow()], VIEW, ground(0.0), device, lamps)
     return Renderer(scene, bounce_depth=2)
 
 
@@ -145,9 +131,6 @@ def test_cached_rows_hold_no_light_of_lamps(device: str, tmp_path: Path) -> None
 # -------------------------------------------------------------------------------- places
 
 
-DOWN = camera(24, 16, 800.0, (0.0, 20.0, 0.0), pitch=-90.0)
-"""Sees 0.6 x 0.4 m of the ground, nearly along its normal."""
-UP = np.array([0.0, 1.0, 0.0])
 EDGE = np.array([[0.0, 1.0, -1.0], [0.0, 1.0, 1.0]])
 """Of a card from x = -2 to 0 at a height of 1 m."""
 
@@ -204,8 +187,7 @@ def test_place_of_a_lamp_above_ground_and_card_is_that_of_closed_forms(
 ) -> None:
     """Lambert's card, and the ground without it: central differences of the irradiance."""
     lamp = replace(lamps_of_both_kinds()[kind], center=np.array([0.3, 1.4, 0.1]))
-    lambert = Material(base_color=(0.6, 0.5, 0.25), metallic=0.0, specular=0.0, roughness=1.0)
-    card = placed(quad((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, -0.5)), lambert)
+    card = placed(quad((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, -0.5)), LAMBERT)
     shown, _, unoccluded = slopes(card, lamp, DOWN, device, 512, 0)
     middles = seen_ground(DOWN, 8).mean(axis=1)
 
@@ -217,7 +199,7 @@ def test_place_of_a_lamp_above_ground_and_card_is_that_of_closed_forms(
     true = [(closed(lamp.center + h) - closed(lamp.center - h)) / 2e-4 for h in step]
     for axis in range(3):
         size = np.abs(true).max()
-        for found, albedo in ((shown, (0.6, 0.5, 0.25)), (unoccluded, 1.0)):
+        for found, albedo in ((shown, COLOR), (unoccluded, 1.0)):
             error = found[axis] - albedo * true[axis]
             assert np.abs(error).max() < 0.05 * size, axis
             assert np.abs(error.mean(axis=0)).max() < 0.005 * size, axis

@@ -16,6 +16,7 @@ from tests.builders.shapes import (
     seen_ground,
     sphere,
 )
+from tests.kernels.test_lamps import surface
 from warpir.core.arrays import Float64Array
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Placed, Receiver, Scene
@@ -38,6 +39,7 @@ UP = np.array([0.0, 1.0, 0.0])
 POWER = np.array([40.0, 30.0, 20.0])
 DOWN = camera(24, 16, 800.0, (0.0, 20.0, 0.0), pitch=-90.0)
 """Sees 0.6 x 0.4 m of the ground, nearly along its normal; a pixel is 2.5 cm wide."""
+VIEW = camera(24, 16, 24.0, (0.0, 1.5, 4.0), pitch=-15.0)
 RUN_COUNT = 16
 STANDARD_ERRORS = 5.0
 """Of a pixel that must match; with 16 runs and some 400 pixels."""
@@ -136,17 +138,8 @@ def test_lamps_penumbra_is_the_part_of_the_lamp_in_view(kind: int, device: str) 
     card = quad((-1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))  # x from -2 to 0
     found = receiver(renderer(placed(card), [lamp], DOWN, device), spp=1024, hides=0)
     expected, whole = [], []
-    g = (np.arange(400) + 0.5) / 400
+    q, m, _ = surface(lamp, 400)
     for p in seen_ground(DOWN)[:, 0]:
-        if kind == 0:
-            z, phi = (a.reshape(-1) for a in np.meshgrid(2.0 * g - 1.0, 2.0 * np.pi * g))
-            r = np.sqrt(1.0 - z * z)
-            m = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
-            q = lamp.center + lamp.radius * m
-        else:
-            s, t = (a.reshape(-1, 1) for a in np.meshgrid(g, g))
-            q = lamp.corner + s * lamp.edge_x + t * lamp.edge_y
-            m = np.broadcast_to(np.cross(lamp.edge_x, lamp.edge_y), q.shape)
         w = q - p
         d = np.linalg.norm(w, axis=1)
         part = np.maximum(w[:, 1], 0.0) * np.maximum(-(w * m).sum(axis=1), 0.0) / d**4
@@ -166,21 +159,15 @@ def test_lamps_penumbra_is_the_part_of_the_lamp_in_view(kind: int, device: str) 
 def test_lamps_in_a_closed_object_leave_the_ground_what_comes_from_afar(device: str) -> None:
     """Without the object the lamp would light the ground; with it around, none of it comes out."""
     lamp = SphereLamp(np.array([0.0, 0.5, 0.0]), 0.1, POWER)
-    r = renderer(placed(box((0.0, 0.5, 0.0), (0.6, 0.6, 0.6))), [lamp], VIEW, device)
+    thing = placed(box((0.0, 0.5, 0.0), (0.6, 0.6, 0.6)))
+    r = renderer(thing, [lamp], VIEW, device)
     only = receiver(r)
     seen = only.unoccluded.max(axis=1) > 0.0
     assert seen.any() and only.lit.max() == 0.0
     assert foreground(r, depth=3).radiance.max() == 0.0
-    with_sky, sky = (receiver(x, constant()) for x in (r, renderer(r_box(), [], VIEW, device)))
+    with_sky, sky = (receiver(x, constant()) for x in (r, renderer(thing, [], VIEW, device)))
     np.testing.assert_array_equal(with_sky.lit, sky.lit)
     np.testing.assert_array_equal(with_sky.unoccluded, sky.unoccluded + only.unoccluded)
-
-
-VIEW = camera(24, 16, 24.0, (0.0, 1.5, 4.0), pitch=-15.0)
-
-
-def r_box() -> Placed:
-    return placed(box((0.0, 0.5, 0.0), (0.6, 0.6, 0.6)))
 
 
 def test_lamps_on_the_ground_light_it_and_shine_no_way_through(device: str) -> None:
@@ -213,16 +200,15 @@ def test_lamps_beside_light_at_infinity_add_up(device: str) -> None:
         lobe((0.5, 0.6, 0.4), 80.0, (9.0, 8.0, 7.0)).lobes, constant((0.4, 0.5, 0.8)).texels
     )
     ball, flat = lamps_of_all_kinds((-0.7, 1.3, 0.6))
-    both, near = ([ball, flat], DARK), [([ball], DARK), ([flat], DARK), ([], sky)]
-    floor = None
+    near = [([ball], DARK), ([flat], DARK), ([], sky)]
 
     def runs(lamps: list[Lamp], light: Light, first: int) -> tuple[Float64Array, Float64Array]:
-        r = renderer(placed(parts, gloss), lamps, VIEW, device, floor, bounce_depth=2)
+        r = renderer(placed(parts, gloss), lamps, VIEW, device, bounce_depth=2)
         on_object = [foreground(r, light, 3, seed=first + s).radiance for s in range(RUN_COUNT)]
         on_ground = [receiver(r, light, seed=first + s).lit for s in range(RUN_COUNT)]
         return np.stack(on_object).astype(np.float64), np.stack(on_ground).astype(np.float64)
 
-    whole = runs(both[0], sky, 0)
+    whole = runs([ball, flat], sky, 0)
     alone = [runs(lamps, light, 100 * (k + 1)) for k, (lamps, light) in enumerate(near)]
     for k in range(2):
         assert_zero(whole[k] - sum(one[k] for one in alone))
@@ -268,15 +254,20 @@ def test_lamps_shade_a_picture_by_the_pixel(device: str) -> None:
     assert (1.0 - exact[rest]).max() < 0.02 and (1.0 - exact[rest]).mean() < 1e-3
 
 
-def both_integrators(
-    device: str, spp: int, receiver: Receiver | None = None
-) -> tuple[TransportIntegrator, MisIntegrator, torch.Tensor]:
-    """Stored rows and paths of one scene: a glossy ball and a box that glows, two lamps, a sky."""
+def ball_beside_glow() -> Placed:
+    """A glossy ball beside a box that glows; they throw light on the ground."""
     parts = [sphere((0.0, 0.6, 0.0), 0.5, 3), box((0.9, 0.3, 0.0), (0.4, 0.6, 0.4), 1)]
     gloss = Material(base_color=(0.7, 0.7, 0.7), metallic=0.2, roughness=0.6)
     glow = Material(base_color=(0.5, 0.5, 0.5), emission=(0.3, 0.2, 0.1))
+    return placed(parts, gloss, glow)
+
+
+def both_integrators(
+    device: str, spp: int, receiver: Receiver | None = None
+) -> tuple[TransportIntegrator, MisIntegrator, torch.Tensor]:
+    """Stored rows and paths of one scene: `ball_beside_glow`, two lamps, a sky."""
     lamps = lamps_of_all_kinds((-0.7, 1.3, 0.6))
-    r = renderer(placed(parts, gloss, glow), lamps, VIEW, device, receiver, bounce_depth=2)
+    r = renderer(ball_beside_glow(), lamps, VIEW, device, receiver, bounce_depth=2)
     pixels = all_pixels(VIEW)
     sky = np.random.default_rng(4).uniform(0.2, 1.0, (16, 32, 3)).astype(np.float32)
     settings = TransportSettings(height_fg=16, height_shadow=16, dtype="float32")
