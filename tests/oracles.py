@@ -422,17 +422,6 @@ EYE = (
 (Belcour & Barla 2017, in their code and in KHR_materials_iridescence)."""
 
 
-def airy(R12: ArrayLike, R23: ArrayLike, delta: ArrayLike) -> Float64Array:
-    """Return ``|r12 + t12 r23 t21 e^(i d) / (1 - r21 r23 e^(i d))|^2``, ``delta`` being d [rad].
-
-    Of a film whose upper surface reflects R12 and whose base R23; r21 = -r12 is in ``delta``.
-    """
-    r12, r23 = np.sqrt(R12), np.sqrt(R23)
-    wave = np.exp(1j * np.asarray(delta))
-    # Half a wave is lost at one of the two surfaces: r12 and r21 differ in sign.
-    return np.abs(-r12 + (1.0 - np.asarray(R12)) * r23 * wave / (1.0 - r12 * r23 * wave)) ** 2
-
-
 def film_fresnel(f0: ArrayLike, ior: float, thickness: float, cosine: ArrayLike) -> Float64Array:
     """Return the reflectance of a thin film on a base, linear Rec.709, shape [..., 3].
 

@@ -374,16 +374,6 @@ def test_composite_and_encode(rng: np.random.Generator) -> None:
 # ----------------------------------------------------------------------- closed-form shadows
 
 
-def test_film_sums_airys_series() -> None:
-    """The series of the film's reflectance in the phase is Airy's formula of amplitudes."""
-    delta = np.linspace(0.0, 2.0 * np.pi, 60)
-    for R12, R23 in ((0.02, 0.04), (0.3, 0.7)):
-        T, r = 1.0 - R12, np.sqrt(R12 * R23)
-        Rs = T * T * R23 / (1.0 - R12 * R23)
-        series = sum(2.0 * (Rs - T) * r**m * np.cos(m * delta) for m in range(1, 120))
-        np.testing.assert_allclose(R12 + Rs + series, o.airy(R12, R23, delta), atol=1e-13)
-
-
 def sky_directions(count: int = 1500) -> np.ndarray:
     """Return directions above ``Y = 0`` of equal shares of its irradiance, midpoint rule."""
     cos2 = (np.arange(count) + 0.5) / count
