@@ -8,7 +8,6 @@ import json
 import os
 import struct
 import time
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -48,6 +47,12 @@ def written(folder: Path, builder: Builder) -> Path:
 
 def load(folder: Path, builder: Builder, **options: Any) -> Asset:
     return read_gltf(written(folder, builder), **options)
+
+
+@pytest.fixture
+def builder() -> Builder:
+    """A correct file, to be changed."""
+    return Builder()
 
 
 fails = partial(unreadable, load_asset)
@@ -490,30 +495,15 @@ def test_damaged_json_is_named_with_position(case: str, tmp_path: Path) -> None:
     fails(path, *words)
 
 
-@pytest.mark.case("M6")
-def test_G23_huge_count_allocates_little(tmp_path: Path) -> None:
-    builder = Builder()
-    FAULTS["M6-G23-count-2^31-limit"][0](builder)
-    tracemalloc.start()
-    try:
-        with pytest.raises(InputError):
-            load(tmp_path, builder)
-        assert tracemalloc.get_traced_memory()[1] < 50e6
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.case("M4")
-def test_G24_no_fallback_to_the_base_name(tmp_path: Path) -> None:
+def test_G24_no_fallback_to_the_base_name(builder: Builder, tmp_path: Path) -> None:
     (tmp_path / "x.png").write_bytes(png())
-    builder = Builder()
     builder.base_color({"uri": "a/b/x.png"})
     fails(written(tmp_path, builder), "/images/0", "x.png")
 
 
 @pytest.mark.case("M3")
-def test_M3_missing_buffer_is_refused(tmp_path: Path) -> None:
-    builder = Builder()
+def test_M3_missing_buffer_is_refused(builder: Builder, tmp_path: Path) -> None:
     builder.json["buffers"][0]["uri"] = "mesh.bin"
     path = tmp_path / "asset.gltf"
     path.write_text(json.dumps(builder.json))
@@ -539,8 +529,7 @@ def test_M21_other_kinds_are_refused(suffix: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["glb", "base64", "bin"])
-def test_G1_containers_agree(kind: str, tmp_path: Path) -> None:
-    builder = Builder()
+def test_G1_containers_agree(builder: Builder, kind: str, tmp_path: Path) -> None:
     path = tmp_path / ("asset.glb" if kind == "glb" else "asset.gltf")
     if kind == "glb":
         path.write_bytes(builder.glb())
@@ -554,9 +543,8 @@ def test_G1_containers_agree(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("code", ["B", "H", "I", "none", "strip", "stride"])
-def test_G1_index_and_layout_kinds(code: str, tmp_path: Path) -> None:
+def test_G1_index_and_layout_kinds(builder: Builder, code: str, tmp_path: Path) -> None:
     """Indices of every width, none, strips and interleaved vertices give the same triangles."""
-    builder = Builder()
     if code in "BHI":
         builder.primitive["indices"] = builder.accessor(TWO.astype(code))
     elif code == "none":
@@ -573,8 +561,7 @@ def test_G1_index_and_layout_kinds(code: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.cross(b - a, c - a), [[0, 0, 1], [0, 0, 1]])
 
 
-def test_G1_material_values(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G1_material_values(builder: Builder, tmp_path: Path) -> None:
     builder.pbr.update(metallicFactor=0.25, roughnessFactor=0.75, baseColorFactor=[1, 0.5, 0.25, 1])
     builder.base_color()
     builder.pbr["metallicRoughnessTexture"] = {"index": builder.texture()}
@@ -598,9 +585,8 @@ def test_G1_material_values(tmp_path: Path) -> None:
     assert any("occlusion" in notice for notice in asset.notices)
 
 
-def test_G2_factors_are_exact(tmp_path: Path) -> None:
+def test_G2_factors_are_exact(builder: Builder, tmp_path: Path) -> None:
     """No factor is rounded to 8 bits."""
-    builder = Builder()
     builder.pbr["baseColorFactor"] = [0.125, 0.126, 0.127, 0.124]
     builder.attribute("COLOR_0", np.full((4, 3), 0.123, "f"))
     asset = load(tmp_path, builder)
@@ -611,9 +597,8 @@ def test_G2_factors_are_exact(tmp_path: Path) -> None:
     np.testing.assert_array_equal(colors, np.array([[0.123] * 3 + [1]] * 4, "f"))
 
 
-def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
+def test_G3_absent_factors_are_one(builder: Builder, tmp_path: Path) -> None:
     """Metallic and roughness default to 1, with and without a material."""
-    builder = Builder()
     for _ in range(2):
         (material,) = load(tmp_path, builder).materials
         assert (material.metallic, material.roughness) == (1.0, 1.0)
@@ -627,18 +612,20 @@ def test_G3_absent_factors_are_one(tmp_path: Path) -> None:
     [("tex%20a.png", "tex a.png"), ("tex a.png", "tex a.png"), ("sch\u00f6n.png", "sch\u00f6n.png"),
      ("sch%C3%B6n.png", "sch\u00f6n.png"), ("a/../b%252e.png", "b%2e.png")],
 )  # fmt: skip
-def test_G4_M5_names_are_decoded_once(uri: str, name: str, tmp_path: Path) -> None:
+def test_G4_M5_names_are_decoded_once(
+    builder: Builder, uri: str, name: str, tmp_path: Path
+) -> None:
     (tmp_path / name).write_bytes(png())
-    builder = Builder()
     builder.base_color({"uri": uri})
     assert load(tmp_path, builder).textures[0].pixels[0, 0].tolist() == [200, 100, 50, 255]
 
 
 @pytest.mark.case("M3")
 @pytest.mark.parametrize("image", ["missing", "corrupt", "ktx2"])
-def test_G5_missing_textures_become_grey_on_request(image: str, tmp_path: Path) -> None:
+def test_G5_missing_textures_become_grey_on_request(
+    builder: Builder, image: str, tmp_path: Path
+) -> None:
     """The base colour becomes one grey texel, a normal map is left out, both are mentioned."""
-    builder = Builder()
     content = {"corrupt": png()[:40], "ktx2": b"\xabKTX 20\xbb" + bytes(80)}.get(image, b"")
     entry = {"bufferView": builder.view(content)} if content else {"uri": "gone.png"}
     builder.base_color(entry)
@@ -662,17 +649,15 @@ def test_G5_missing_textures_become_grey_on_request(image: str, tmp_path: Path) 
     ids="BHbh",
 )
 def test_G6_M9_normalised_uv_equals_float(
-    codes: np.ndarray, values: list[float], tmp_path: Path
+    builder: Builder, codes: np.ndarray, values: list[float], tmp_path: Path
 ) -> None:
-    builder = Builder()
     builder.attribute("TEXCOORD_0", codes, normalized=True)
     uv0 = load(tmp_path, builder).primitives[0].uv0
     np.testing.assert_array_equal(uv0, np.array(values, "f").reshape(4, 2))
 
 
 @pytest.mark.case("M9")
-def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G6_normalised_colors_equal_float(builder: Builder, tmp_path: Path) -> None:
     for codes, scale in ((np.full((4, 4), 51, "B"), 255), (np.full((4, 3), 13107, "H"), 65535)):
         builder.attribute("COLOR_0", codes, normalized=True)
         colors = load(tmp_path, builder).primitives[0].colors
@@ -683,9 +668,10 @@ def test_G6_normalised_colors_equal_float(tmp_path: Path) -> None:
 @pytest.mark.case("M9")
 @pytest.mark.parametrize("code", ["b", "B", "h", "H"])
 @pytest.mark.parametrize("normalized", [False, True])
-def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_path: Path) -> None:
+def test_G7_M9_quantised_positions_equal_float(
+    builder: Builder, code: str, normalized: bool, tmp_path: Path
+) -> None:
     top = np.iinfo(code).max
-    builder = Builder()
     builder.json["extensionsRequired"] = ["KHR_mesh_quantization"]
     builder.attribute("POSITION", (CORNERS * top).astype(code), normalized=normalized)
     low = np.array([[-128 if code in "bB" else -32768, 0, 0]] * 4)
@@ -701,14 +687,13 @@ def test_G7_M9_quantised_positions_equal_float(code: str, normalized: bool, tmp_
 @pytest.mark.case("M6")
 @pytest.mark.parametrize("code", ["B", "H", "I"])
 @pytest.mark.parametrize("base", ["stored", "zeros"])
-def test_G8_sparse_equals_dense(code: str, base: str, tmp_path: Path) -> None:
+def test_G8_sparse_equals_dense(builder: Builder, code: str, base: str, tmp_path: Path) -> None:
     """Replaced vertices, on a stored base or on zeros, give the mesh that states them all."""
     expected = CORNERS if base == "stored" else np.zeros_like(CORNERS)
     expected = expected.copy()
     expected[[1, 3]] = [[2, 0, 1], [0, 3, 1]]
     expected[2, 1] += base == "zeros"  # so that both triangles have an area
     at = [1, 3] if base == "stored" else [1, 2, 3]
-    builder = Builder()
     sparse(at, expected[at], code)(builder)
     if base == "zeros":
         del builder.json["accessors"][0]["bufferView"]
@@ -718,10 +703,9 @@ def test_G8_sparse_equals_dense(code: str, base: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M6")
-def test_G8_sparse_quantised_uv_equals_dense(tmp_path: Path) -> None:
+def test_G8_sparse_quantised_uv_equals_dense(builder: Builder, tmp_path: Path) -> None:
     """Normalised integers are replaced before they are scaled; other attributes may be sparse."""
     codes = np.array([[0, 255], [255, 255], [255, 0], [0, 0]], "B")
-    builder = Builder()
     builder.attribute("TEXCOORD_0", codes, normalized=True, stride=4)
     builder.json["accessors"][-1]["sparse"] = {
         "count": 1,
@@ -732,17 +716,7 @@ def test_G8_sparse_quantised_uv_equals_dense(tmp_path: Path) -> None:
     np.testing.assert_allclose(uv0, [[0, 1], [1, 1], [1, 0], [0.2, 1]], rtol=FLOAT32_RTOL)
 
 
-@pytest.mark.case("M6")
-def test_G8_sparse_accessor_of_a_morph_target_is_never_read(tmp_path: Path) -> None:
-    """A sparse accessor matters only where something drawn uses it."""
-    builder = Builder()
-    builder.primitive["targets"] = [{"POSITION": builder.accessor(CORNERS)}]
-    builder.json["accessors"][-1]["sparse"] = {"count": 1}
-    assert any("morph" in notice for notice in load(tmp_path, builder).notices)
-
-
-def test_G9_tangents_and_second_uv_are_used(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G9_tangents_and_second_uv_are_used(builder: Builder, tmp_path: Path) -> None:
     builder.attribute("TANGENT", TANGENTS * np.array([1, 1, 1, -1], "f"))
     builder.attribute("TEXCOORD_1", UVS / 2)
     builder.base_color().update(texCoord=1)
@@ -755,18 +729,16 @@ def test_G9_tangents_and_second_uv_are_used(tmp_path: Path) -> None:
     assert slot is not None and slot.uv_set == 1
 
 
-def test_G9_absent_uv_set_is_noted(tmp_path: Path) -> None:
+def test_G9_absent_uv_set_is_noted(builder: Builder, tmp_path: Path) -> None:
     """A texture whose coordinates are absent reads texel zero, with a notice."""
-    builder = Builder()
     builder.base_color().update(texCoord=1)
     asset = load(tmp_path, builder)
     np.testing.assert_array_equal(asset.primitives[0].uv1, np.zeros((4, 2)))
     assert any("no TEXCOORD_1" in notice for notice in asset.notices)
 
 
-def test_G10_sampler_and_normal_scale(tmp_path: Path) -> None:
+def test_G10_sampler_and_normal_scale(builder: Builder, tmp_path: Path) -> None:
     """Wrap modes and the scale of a normal map are used; one image may have several wraps."""
-    builder = Builder()
     builder.base_color(wrapS=33071, wrapT=33648, magFilter=9728)
     builder.json["samplers"].append({})
     builder.json["textures"].append({"source": 0, "sampler": 1})
@@ -780,9 +752,8 @@ def test_G10_sampler_and_normal_scale(tmp_path: Path) -> None:
     assert any("nearest" in notice for notice in asset.notices)
 
 
-def test_G10_texture_transform(tmp_path: Path) -> None:
+def test_G10_texture_transform(builder: Builder, tmp_path: Path) -> None:
     """Match the extension's GLSL: translation * rotation * scale, columns first."""
-    builder = Builder()
     angle, (sx, sy), (ox, oy) = 0.3, (2.0, 3.0), (0.1, 0.2)
     builder.attribute("TEXCOORD_1", UVS)
     builder.base_color()["extensions"] = {
@@ -799,9 +770,8 @@ def test_G10_texture_transform(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.reshape(slot.transform, (2, 3)), matrix[:2])
 
 
-def test_G11_material_extensions(tmp_path: Path) -> None:
+def test_G11_material_extensions(builder: Builder, tmp_path: Path) -> None:
     """Emissive strength multiplies; unlit is matte; what is not supported gives one notice."""
-    builder = Builder()
     builder.material.update(
         name="lamp",
         emissiveFactor=[1, 0.5, 0],
@@ -831,9 +801,8 @@ def test_G11_material_extensions(tmp_path: Path) -> None:
     assert any("unlit" in notice for notice in asset.notices)
 
 
-def test_G11_layers_are_read(tmp_path: Path) -> None:
+def test_G11_layers_are_read(builder: Builder, tmp_path: Path) -> None:
     """Coat, sheen, glass and reflection keep factors, textures, UV sets and transforms."""
-    builder = Builder()
     builder.base_color()
     turned = {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": {"scale": [2, 3]}}}
     plain = {"index": 0}
@@ -881,8 +850,7 @@ def test_G11_layers_are_read(tmp_path: Path) -> None:
     assert any("not blurred" in notice for notice in asset.notices)
 
 
-def test_G11_layers_are_clamped(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G11_layers_are_clamped(builder: Builder, tmp_path: Path) -> None:
     builder.material["extensions"] = {
         "KHR_materials_ior": {"ior": 0.5},
         "KHR_materials_clearcoat": {"clearcoatFactor": 2, "clearcoatRoughnessFactor": -1},
@@ -905,9 +873,8 @@ def test_G11_layers_are_clamped(tmp_path: Path) -> None:
     assert sum("clamped" in notice for notice in asset.notices) == 11
 
 
-def test_G11_anisotropy_needs_a_direction(tmp_path: Path) -> None:
+def test_G11_anisotropy_needs_a_direction(builder: Builder, tmp_path: Path) -> None:
     """Without tangents and texture coordinates it is named; without strength it is not read."""
-    builder = Builder()
     builder.material["extensions"] = {"KHR_materials_anisotropy": {"anisotropyStrength": 1}}
     assert load(tmp_path, builder).notices == ()
     del builder.primitive["attributes"]["TEXCOORD_0"]
@@ -918,9 +885,8 @@ def test_G11_anisotropy_needs_a_direction(tmp_path: Path) -> None:
     assert asset.notices == () and asset.materials[0].anisotropy_rotation == 0.0
 
 
-def test_G11_glass_says_what_it_does_not_do(tmp_path: Path) -> None:
+def test_G11_glass_says_what_it_does_not_do(builder: Builder, tmp_path: Path) -> None:
     """One notice of a tint or blur that is lost, none for clear glass."""
-    builder = Builder()
     builder.material.update(
         pbrMetallicRoughness={"metallicFactor": 0, "roughnessFactor": 0},
         extensions={"KHR_materials_transmission": {"transmissionFactor": 1}},
@@ -999,9 +965,8 @@ def test_G11_glass_bodies_are_looked_at() -> None:
     assert glass_notices([inward], [replace(solid, thickness=0.0)]) == []
 
 
-def test_G25_scale_of_zero_on_all_axes_hides(tmp_path: Path) -> None:
+def test_G25_scale_of_zero_on_all_axes_hides(builder: Builder, tmp_path: Path) -> None:
     """So animations hide a part and its children, by the specification; the rest is drawn."""
-    builder = Builder()
     nodes = [{"mesh": 0}, {"mesh": 0, "scale": [0, 0, 0], "children": [2]}, {"mesh": 0}]
     builder.json.update(nodes=nodes, scenes=[{"nodes": [0, 1]}])
     asset = load(tmp_path, builder)
@@ -1011,14 +976,13 @@ def test_G25_scale_of_zero_on_all_axes_hides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("fallback", [None, {}, {"baseColorFactor": [1, 0, 0, 1]}])
 def test_G11_specular_glossiness_is_converted(
-    tmp_path: Path, fallback: dict[str, Any] | None
+    builder: Builder, tmp_path: Path, fallback: dict[str, Any] | None
 ) -> None:
     """Specular-glossiness becomes a dielectric whose F0 is its specular colour.
 
     It goes before a metallic fallback, as its specification asks. The texture's alpha is
     glossiness; roughness is what the factor times it leaves to 1.
     """
-    builder = Builder()
     builder.base_color()
     extension = {
         "diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.5, 0.25, 1],
@@ -1047,16 +1011,14 @@ def test_G11_specular_glossiness_is_converted(
 @pytest.mark.parametrize(
     "name", ["KHR_texture_transform", "KHR_materials_clearcoat", "KHR_lights_punctual"]
 )
-def test_G12_known_required_extensions_load(name: str, tmp_path: Path) -> None:
-    builder = Builder()
+def test_G12_known_required_extensions_load(builder: Builder, name: str, tmp_path: Path) -> None:
     builder.json.update(extensionsRequired=[name], extensionsUsed=[name])
     load(tmp_path, builder)
 
 
 @pytest.mark.case("M17")
-def test_G13_used_but_not_required_reads_the_fallback(tmp_path: Path) -> None:
+def test_G13_used_but_not_required_reads_the_fallback(builder: Builder, tmp_path: Path) -> None:
     """Compression that is only offered is passed over; its fallback is read."""
-    builder = Builder()
     builder.json["extensionsUsed"] = ["KHR_draco_mesh_compression", "KHR_texture_basisu"]
     builder.primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0}}
     builder.base_color()
@@ -1067,8 +1029,7 @@ def test_G13_used_but_not_required_reads_the_fallback(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M17")
-def test_G13_webp_is_read(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G13_webp_is_read(builder: Builder, tmp_path: Path) -> None:
     builder.json["extensionsRequired"] = ["EXT_texture_webp"]
     builder.base_color({"bufferView": builder.view(png(kind="WEBP")), "mimeType": "image/webp"})
     builder.json["textures"][0] = {"extensions": {"EXT_texture_webp": {"source": 0}}}
@@ -1076,7 +1037,7 @@ def test_G13_webp_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["16-bit grey", "16-bit rgb", "palette", "grey", "rgba"])
-def test_image_kinds_become_rgba(kind: str, tmp_path: Path) -> None:
+def test_image_kinds_become_rgba(builder: Builder, kind: str, tmp_path: Path) -> None:
     """Every kind of PNG becomes 8-bit RGBA without rescaling its codes."""
     image, expected = {
         "16-bit grey": (Image.fromarray(np.full((2, 2), 200 * 257, "H")), [200, 200, 200, 255]),
@@ -1090,7 +1051,6 @@ def test_image_kinds_become_rgba(kind: str, tmp_path: Path) -> None:
         write_image(path, image)
     else:
         image.save(path)
-    builder = Builder()
     builder.base_color({"bufferView": builder.view(path.read_bytes())})
     asset = load(tmp_path, builder)
     assert asset.textures[0].pixels[1, 1].tolist() == expected
@@ -1124,16 +1084,7 @@ def test_M14_triangles_are_limited(kind: str, tmp_path: Path) -> None:
     fails(path, *words, limits=Limits(triangles=1))
 
 
-def test_G17_no_scenes_draws_the_roots(tmp_path: Path) -> None:
-    builder = Builder()
-    del builder.json["scenes"], builder.json["scene"]
-    asset = load(tmp_path, builder)
-    assert len(asset.primitives) == 1
-    assert any("no scenes" in notice for notice in asset.notices)
-
-
-def test_G17_scene_member_selects(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G17_scene_member_selects(builder: Builder, tmp_path: Path) -> None:
     builder.json["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
     builder.json.update(scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1)
     assert load(tmp_path, builder).bounds()[0][0] == 5
@@ -1142,9 +1093,8 @@ def test_G17_scene_member_selects(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M10")
-def test_G16_scene_that_lists_an_inner_node(tmp_path: Path) -> None:
+def test_G16_scene_that_lists_an_inner_node(builder: Builder, tmp_path: Path) -> None:
     """A listed inner node keeps its parents' transforms and is drawn once."""
-    builder = Builder()
     builder.json["nodes"] = [{"children": [1], "translation": [5, 0, 0]}, {"mesh": 0}]
     builder.json["scenes"] = [{"nodes": [1]}]
     asset = load(tmp_path, builder)
@@ -1184,11 +1134,10 @@ FAULTS |= {
 }  # fmt: skip
 
 
-def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
+def test_G18_skinned_mesh_stands_as_its_joints_do(builder: Builder, tmp_path: Path) -> None:
     """Linear blend of joint * inverse bind matrix; the mesh's own node does not count."""
     bind = np.eye(4)
     bind[:3, 3] = (-1.0, 0.0, 0.0)
-    builder = Builder()
     matrices = np.stack([np.eye(4).T.ravel(), bind.T.ravel()]).astype("f")
     view = builder.view(matrices.tobytes())
     builder.json["accessors"].append(
@@ -1204,41 +1153,65 @@ def test_G18_skinned_mesh_stands_as_its_joints_do(tmp_path: Path) -> None:
     np.testing.assert_array_equal(square.normals, NORMALS)
 
 
-def test_G18_mirrored_skin_keeps_the_outside(tmp_path: Path) -> None:
+def test_G18_mirrored_skin_keeps_the_outside(builder: Builder, tmp_path: Path) -> None:
     """Joints that mirror turn the winding round, and the normals follow."""
-    builder = Builder()
     skinned([[1, 0]] * 4, [{"scale": [-1, 1, 1]}, {}])(builder)
     asset = load(tmp_path, builder)
     assert winding_agrees(asset)
     assert asset.primitives[0].positions[1, 0] == -1.0
 
 
-def test_G18_rest_pose_is_noted(tmp_path: Path) -> None:
-    builder = Builder()
-    skinned([[1, 0]] * 4, [{}, {}])(builder)
-    builder.json.update(animations=[{}])
-    builder.primitive["targets"] = [{"POSITION": 0}]
-    asset = load(tmp_path, builder)
-    for word in ("skin", "animations", "morph"):
-        assert any(word in notice for notice in asset.notices)
-    np.testing.assert_array_equal(asset.primitives[0].positions, CORNERS)
-
-
 @pytest.mark.case("M12")
-def test_G19_fan_is_expanded(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G19_fan_is_expanded(builder: Builder, tmp_path: Path) -> None:
     builder.primitive.update(mode=6, indices=builder.accessor(np.array([0, 1, 2, 3], "B")))
     (square,) = load(tmp_path, builder).primitives
     assert square.indices.tolist() == [[1, 2, 0], [2, 3, 0]]
 
 
-@pytest.mark.case("M12")
-def test_G19_lines_beside_triangles_are_noted(tmp_path: Path) -> None:
-    builder = Builder()
-    builder.json["meshes"][0]["primitives"].append(builder.primitive | {"mode": 1})
+NOTED: dict[str, tuple[Plant, tuple[str, ...]]] = {
+    "M6-G8-morph-target": (
+        lambda b: (
+            b.primitive.update(targets=[{"POSITION": b.accessor(CORNERS)}]),
+            b.json["accessors"][-1].update(sparse={"count": 1}),
+        ),
+        ("morph",)),
+    "G17-no-scenes": (lambda b: [b.json.pop(key) for key in ("scenes", "scene")], ("no scenes",)),
+    "G18-rest-pose": (
+        lambda b: (
+            skinned([[1, 0]] * 4, [{}, {}])(b),
+            b.json.update(animations=[{}]),
+            b.primitive.update(targets=[{"POSITION": 0}]),
+        ),
+        ("skin", "animations", "morph")),
+    "M12-G19-lines-beside-triangles": (
+        lambda b: b.json["meshes"][0]["primitives"].append(b.primitive | {"mode": 1}),
+        ("points or lines",)),
+    "zero-normals-come-from-the-faces": (
+        lambda b: b.attribute("NORMAL", NORMALS * np.array([[1], [0], [2], [1]], "f")),
+        ("1 normals of length zero",)),
+    "hidden-node": (
+        lambda b: b.json.update(
+            nodes=[
+                {"mesh": 0},
+                {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]},
+                {"mesh": 0},
+            ],
+            scenes=[{"nodes": [0, 1]}]),
+        ()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NOTED)
+def test_what_changes_nothing_is_noted(builder: Builder, case: str, tmp_path: Path) -> None:
+    """The square stays the only primitive, as it was; a notice has each of the words."""
+    plant, words = NOTED[case]
+    plant(builder)
     asset = load(tmp_path, builder)
-    assert len(asset.primitives) == 1
-    assert any("points or lines" in notice for notice in asset.notices)
+    (square,) = asset.primitives
+    np.testing.assert_array_equal(square.positions, CORNERS)
+    np.testing.assert_array_equal(square.normals, NORMALS)
+    for word in words:
+        assert any(word in notice for notice in asset.notices)
 
 
 def winding_agrees(asset: Asset) -> bool:
@@ -1253,9 +1226,10 @@ def winding_agrees(asset: Asset) -> bool:
 
 @pytest.mark.case("M11")
 @pytest.mark.parametrize("scale", [[-1, 1, 1], [-2, -3, -1], [1, 1, -1], [-1, -1, 1]])
-def test_G25_mirrored_node_keeps_the_outside(scale: list[float], tmp_path: Path) -> None:
+def test_G25_mirrored_node_keeps_the_outside(
+    builder: Builder, scale: list[float], tmp_path: Path
+) -> None:
     """Winding agrees with the normals, and bitangents follow the mirror."""
-    builder = Builder()
     builder.attribute("TANGENT", TANGENTS)
     node(scale=scale)(builder)
     asset = load(tmp_path, builder)
@@ -1268,9 +1242,8 @@ def test_G25_mirrored_node_keeps_the_outside(scale: list[float], tmp_path: Path)
 
 
 @pytest.mark.case("M11")
-def test_M11_shear_keeps_normals_perpendicular(tmp_path: Path) -> None:
+def test_M11_shear_keeps_normals_perpendicular(builder: Builder, tmp_path: Path) -> None:
     """Normals under shear stay perpendicular to the surface (inverse transpose)."""
-    builder = Builder()
     node(matrix=[1, 0, 2, 0, 0, 1, 0, 0, 0.5, 0, 3, 0, 0, 0, 0, 1])(builder)
     asset = load(tmp_path, builder)
     (square,) = asset.primitives
@@ -1280,9 +1253,8 @@ def test_M11_shear_keeps_normals_perpendicular(tmp_path: Path) -> None:
     assert winding_agrees(asset)
 
 
-def test_node_rotation_and_order(tmp_path: Path) -> None:
+def test_node_rotation_and_order(builder: Builder, tmp_path: Path) -> None:
     """TRS apply as T * R * S, parents on the left; 90 degrees about +Z takes +X to +Y."""
-    builder = Builder()
     half = np.sqrt(0.5)
     builder.json["nodes"] = [
         {"children": [1], "translation": [10, 0, 0]},
@@ -1292,33 +1264,22 @@ def test_node_rotation_and_order(tmp_path: Path) -> None:
     np.testing.assert_allclose(square.positions[1], [10, 2, 1], atol=1e-12)
 
 
-def test_G26_absent_normals_mean_flat(tmp_path: Path) -> None:
+def test_G26_absent_normals_mean_flat(builder: Builder, tmp_path: Path) -> None:
     """No NORMAL: no shading normals; TANGENT is ignored then."""
-    builder = Builder()
     builder.attribute("TANGENT", TANGENTS)
     del builder.primitive["attributes"]["NORMAL"]
     (square,) = load(tmp_path, builder).primitives
     assert square.normals is None and square.tangents is None
 
 
-def test_zero_normals_come_from_the_faces(tmp_path: Path) -> None:
-    builder = Builder()
-    builder.attribute("NORMAL", NORMALS * np.array([[1], [0], [2], [1]], "f"))
-    asset = load(tmp_path, builder)
-    np.testing.assert_array_equal(asset.primitives[0].normals, NORMALS)
-    assert any("1 normals of length zero" in notice for notice in asset.notices)
-
-
-def test_G27_camera_node_with_mesh_children(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G27_camera_node_with_mesh_children(builder: Builder, tmp_path: Path) -> None:
     builder.json["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}]
     builder.json["nodes"] = [{"camera": 0, "children": [1], "translation": [5, 0, 0]}, {"mesh": 0}]
     assert load(tmp_path, builder).bounds()[0][0] == 5
 
 
 @pytest.mark.case("M10")
-def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G28_M10_deep_chain_loads(builder: Builder, tmp_path: Path) -> None:
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
     builder.json["nodes"] = [*chain, {"mesh": 0}]
     assert load(tmp_path, builder).bounds()[0][0] == 2999 * 0.5
@@ -1326,12 +1287,11 @@ def test_G28_M10_deep_chain_loads(tmp_path: Path) -> None:
 
 @pytest.mark.case("M10")
 @pytest.mark.parametrize("code", ["f", "b", "h"])
-def test_G28_instances_equal_nodes(code: str, tmp_path: Path) -> None:
+def test_G28_instances_equal_nodes(builder: Builder, code: str, tmp_path: Path) -> None:
     """EXT_mesh_gpu_instancing places the mesh where nodes of the same numbers do."""
     shifts = np.array([[1, 0, 0], [0, 2, 0], [0, 0, 3]], "f")
     turns = np.array([[0, 0, 0, 1], [0, 0, 1, 0], [1, 0, 0, 0]], "f")
     scales = np.array([[1, 1, 1], [2, 1, 1], [-1, 1, 1]], "f")
-    builder = Builder()
     stored = turns if code == "f" else (turns * np.iinfo(code).max).astype(code)
     instanced(TRANSLATION=shifts, ROTATION=stored, SCALE=scales)(builder)
     node(translation=[5, 0, 0], scale=[1, 2, 1])(builder)
@@ -1350,8 +1310,7 @@ def test_G28_instances_equal_nodes(code: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.normals, b.normals)
 
 
-def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:
-    builder = Builder()
+def test_G29_primitives_are_not_merged(builder: Builder, tmp_path: Path) -> None:
     builder.json["materials"].append({"name": "second"})
     builder.json["meshes"][0]["primitives"].append(builder.primitive | {"material": 1})
     builder.json["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
@@ -1362,8 +1321,9 @@ def test_G29_primitives_are_not_merged(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M13")
-def test_M13_degenerate_and_repeated_triangles_are_counted(tmp_path: Path) -> None:
-    builder = Builder()
+def test_M13_degenerate_and_repeated_triangles_are_counted(
+    builder: Builder, tmp_path: Path
+) -> None:
     bad = np.array([[0, 1, 2], [0, 2, 3], [1, 1, 2], [2, 0, 1], [0, 2, 1]], "H")
     builder.primitive["indices"] = builder.accessor(bad.reshape(-1))
     asset = load(tmp_path, builder)
@@ -1373,9 +1333,8 @@ def test_M13_degenerate_and_repeated_triangles_are_counted(tmp_path: Path) -> No
 
 
 @pytest.mark.case("M14")
-def test_M14_one_skin_of_many_nodes_is_read_once(tmp_path: Path) -> None:
+def test_M14_one_skin_of_many_nodes_is_read_once(builder: Builder, tmp_path: Path) -> None:
     """100 meshes on one skin of 3000 joints take what one takes, not 100 times that."""
-    builder = Builder()
     skinned([[1, 0]] * 4, [{} for _ in range(3000)])(builder)
     builder.json["nodes"] += [dict(builder.json["nodes"][0]) for _ in range(99)]
     count = len(builder.json["nodes"])
@@ -1386,9 +1345,8 @@ def test_M14_one_skin_of_many_nodes_is_read_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M14")
-def test_M14_images_of_one_buffer_view_are_counted(tmp_path: Path) -> None:
+def test_M14_images_of_one_buffer_view_are_counted(builder: Builder, tmp_path: Path) -> None:
     """Images that nothing draws cost nothing; what is drawn has as many bytes as a file at most."""
-    builder = Builder()
     content = png() + bytes(100_000)
     view = builder.view(content)
     image = {"bufferView": view, "mimeType": "image/png"}
@@ -1413,9 +1371,10 @@ def test_M14_images_of_one_buffer_view_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.case("M14")
-def test_M14_textures_made_of_others_are_shared_and_counted(tmp_path: Path) -> None:
+def test_M14_textures_made_of_others_are_shared_and_counted(
+    builder: Builder, tmp_path: Path
+) -> None:
     """Materials of one texture and one glossiness share what is made of it."""
-    builder = Builder()
     index = builder.texture({"bufferView": builder.view(png(size=8)), "mimeType": "image/png"})
     primitives = builder.json["meshes"][0]["primitives"]
     for k in range(40):
@@ -1434,19 +1393,17 @@ def test_M14_textures_made_of_others_are_shared_and_counted(tmp_path: Path) -> N
 
 @pytest.mark.case("M14")
 def test_M14_limit_of_texture_pixels_is_ours(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    builder: Builder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pillow warns of its own limit, and refuses what is twice that: neither reaches the user."""
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 16)
-    builder = Builder()
     builder.base_color({"bufferView": builder.view(png(size=8)), "mimeType": "image/png"})
     assert load(tmp_path, builder).textures[0].pixels.shape == (8, 8, 4)
     assert Image.MAX_IMAGE_PIXELS == 16
 
 
 @pytest.mark.case("M18")
-def test_M18_values_out_of_range_are_clamped(tmp_path: Path) -> None:
-    builder = Builder()
+def test_M18_values_out_of_range_are_clamped(builder: Builder, tmp_path: Path) -> None:
     builder.pbr.update(metallicFactor=2, roughnessFactor=-1, baseColorFactor=[2, 0, 0, 1])
     builder.material.update(emissiveFactor=[-1, 0, 0], alphaCutoff=3)
     asset = load(tmp_path, builder)
@@ -1468,23 +1425,13 @@ def test_M18_values_out_of_range_are_clamped(tmp_path: Path) -> None:
     [pytest.param(1e300, 1.0, id="M18-emission"), pytest.param(1.0, 1e38, id="M18-strength")],
 )
 def test_emission_beyond_all_light_is_refused(
-    tmp_path: Path, factor: float, strength: float
+    builder: Builder, tmp_path: Path, factor: float, strength: float
 ) -> None:
     """It would be infinite in the picture, far from the file that is at fault."""
-    builder = Builder()
     extension = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
     builder.material.update(emissiveFactor=[factor, 1, 1], extensions=extension)
     with pytest.raises(InputError, match=r"/materials/0: emission out of range .*limit 1e\+12"):
         load(tmp_path, builder)
-
-
-def test_hidden_node_is_not_drawn(tmp_path: Path) -> None:
-    builder = Builder()
-    builder.json["nodes"] += [
-        {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2]}, {"mesh": 0}
-    ]  # fmt: skip
-    builder.json["scenes"] = [{"nodes": [0, 1]}]
-    assert len(load(tmp_path, builder).primitives) == 1
 
 
 ODD: tuple[Any, ...] = (
@@ -1496,10 +1443,9 @@ ODD: tuple[Any, ...] = (
 @pytest.mark.parametrize("kind", ["instances", "skin"])
 @pytest.mark.filterwarnings("error")
 def test_odd_values_give_an_asset_or_our_error(
-    kind: str, tmp_path: Path, rng: np.random.Generator
+    builder: Builder, kind: str, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     """Any value of the JSON replaced by an odd one ends in a sound asset or in one InputError."""
-    builder = Builder()
     builder.base_color()["extensions"] = {"KHR_texture_transform": {"scale": [2, 3]}}
     builder.attribute("TANGENT", TANGENTS)
     sparse([2], np.full((1, 3), 2.0))(builder)
