@@ -5,7 +5,6 @@ import json
 import os
 import pickle
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -725,15 +724,6 @@ def test_command_reports_bad_inputs_together(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.case("F5")
-def test_command_never_writes_over_its_inputs(scene: list[str], tmp_path: Path) -> None:
-    """--out may not be the folder of an input: --overwrite could replace the photo (F5)."""
-    scene[scene.index("--out") + 1] = str(tmp_path / "x" / "..")
-    with pytest.raises(InputError, match="--out: holds the input") as caught:
-        read_inputs(parse([*scene, "--overwrite"]).config)
-    assert caught.value.code == ExitCode.USAGE
-
-
 @pytest.mark.parametrize(
     ("flag", "name", "target"),
     [
@@ -946,20 +936,6 @@ def test_main_tells_the_truth_by_status(
     assert text.count("error:") == (0 if status == 130 else 1)
     assert warpir.insert.main([*scene, "--debug"]) == status
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_main_stops_on_sigterm(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], scene: list[str]
-) -> None:
-    """SIGTERM unwinds like Ctrl-C, with status 143, and the old handler comes back."""
-
-    def terminate(config: InsertConfig) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(warpir.insert, "insert", terminate)
-    assert warpir.insert.main(scene) == 143
-    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_line_is_written_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

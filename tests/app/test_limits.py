@@ -191,17 +191,6 @@ def test_unusable_output_is_refused(
         assert word.lower() in lines[0].lower()
 
 
-@pytest.mark.case("F6")
-@pytest.mark.parametrize("mode", [[], ["--validate"]], ids=["run", "validate"])
-def test_locked_output_is_refused(mode: list[str], inputs: Path, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), OutputFolder(tmp_path / "out"):
-        argv = [*arguments(inputs, "out"), "--overwrite", *mode]
-        words = f"locked by pid {os.getpid()} on "
-        assert_fails(argv, ExitCode.OUTPUT, words, cwd=tmp_path)
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.case("F5", "F6")
 def test_abandoned_lock_and_new_folders_are_accepted(inputs: Path, tmp_path: Path) -> None:
     """The lock of a killed run is nobody's, and --validate leaves it; a new --out is not made."""

@@ -32,7 +32,7 @@ from warpir.app.config import InsertConfig
 from warpir.batch.task import CHECK, Task, do_task
 from warpir.core.arrays import FloatArray, PixelArray
 from warpir.core.color import linear_to_gamma
-from warpir.core.errors import ExitCode, InputError
+from warpir.core.errors import ExitCode
 from warpir.insert import main
 from warpir.io.cameras.reader import read_camera
 from warpir.io.images.photos import read_envmap, read_photo
@@ -249,14 +249,6 @@ def test_run_record_replays_the_run(run: Run, tmp_path: Path) -> None:
     assert differs == {"out"}
 
 
-def test_threads_do_not_change_the_files(run: Run, inputs: Path, tmp_path: Path) -> None:
-    device = run.record["config"]["device"]
-    for threads in ("1", "5"):
-        out = tmp_path / threads
-        other = go(arguments(inputs, out, threads=threads, device=device), out)
-        assert other.record["files"]["composite.png"] == run.record["files"]["composite.png"]
-
-
 def test_insert_from_python(run: Run, inputs: Path, tmp_path: Path) -> None:
     """``from warpir import insert; insert(InsertConfig(...))`` is the command line's twin."""
     insertion = insert(
@@ -443,16 +435,6 @@ def results(tmp_path: Path) -> Path:
     return out
 
 
-def test_overwriting_leaves_no_file_of_the_old_run(inputs: Path, tmp_path: Path) -> None:
-    """A run without lobes over one with them: lobes.json would tell of another light."""
-    out = tmp_path / "out"
-    go(arguments(inputs, out, light=str(inputs / "lobes.json")), out)
-    assert (out / "lobes.json").exists()
-    (out / "notes.txt").write_text("mine")
-    go([*arguments(inputs, out), "--overwrite"], out)
-    assert {p.name for p in out.iterdir()} == {*ALWAYS, "run.json", "notes.txt"}
-
-
 def test_failure_while_rendering_keeps_old_results(
     inputs: Path, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -468,17 +450,6 @@ def test_failure_while_rendering_keeps_old_results(
     assert "error: memory:" in capsys.readouterr().err
     assert digest(results) == before
     assert {p.name for p in results.iterdir()} == {"composite.png", "run.json"}
-
-
-def test_errors_reach_python_as_exceptions(inputs: Path, tmp_path: Path) -> None:
-    """From Python a bad input is an InputError with its place, and nothing is written."""
-    config = InsertConfig(
-        photo=str(inputs / "none.png"), asset=str(inputs / "box.glb"), out=str(tmp_path / "o")
-    )
-    with pytest.raises(InputError) as caught:
-        insert(config)
-    assert caught.value.where.endswith("none.png") and caught.value.code == ExitCode.INPUT
-    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.slow

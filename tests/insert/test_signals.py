@@ -28,10 +28,12 @@ def send(number: int = signal.SIGTERM) -> None:
 
 
 def test_a_signal_is_raised_at_once_where_nothing_defers_it() -> None:
+    before = signal.getsignal(signal.SIGHUP)
     with pytest.raises(Stopped, match="SIGHUP") as caught, signals.handled():
         send(signal.SIGHUP)
         pytest.fail("went on")
     assert caught.value.number == signal.SIGHUP
+    assert signal.getsignal(signal.SIGHUP) == before
 
 
 def test_a_deferred_signal_waits_for_the_border(capfd: pytest.CaptureFixture[str]) -> None:

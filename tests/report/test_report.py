@@ -22,14 +22,13 @@ from PIL import Image
 from playwright.sync_api import Locator
 
 from tests.builders.insertions import Run, arguments, go, write_inputs
-from tests.builders.insertions import read_layers as read_planes
 from tests.builders.outcome import outcome
 from tests.builders.programs.browser import Opened, needs_chromium, open_browser
 from warpir.app.command import parse
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.insert import main
-from warpir.io.layers import BACKGROUND_DEPTH, read_layers
+from warpir.io.layers import read_layers
 from warpir.report import page as report
 from warpir.report.command import main as remake
 from warpir.report.command import read_results
@@ -482,27 +481,6 @@ def test_plot_has_axes_in_round_numbers() -> None:
     assert all(plot.top <= y <= plot.bottom for y, _ in plot.y_ticks)
 
 
-def test_layers_are_read_as_they_were_written(run: Run) -> None:
-    """Every plane, and infinity where no object is."""
-    layers, planes = read_layers(run.out / "layers.exr"), read_planes(run.out / "layers.exr")
-    assert layers.composite.shape == (*SMALL[::-1], 3)
-    for prefix, suffixes, plane in (
-        ("", "RGB", layers.composite),
-        ("fg", "RGBA", layers.foreground),
-        ("shadow", "RGB", layers.shadow_ratio),
-        ("normal", "XYZ", layers.normal),
-        ("roughness", "Y", layers.roughness),
-    ):
-        assert plane is not None
-        for k, suffix in enumerate(suffixes):
-            found = plane if plane.ndim == 2 else plane[..., k]
-            name = f"{prefix}.{suffix}" if prefix else suffix
-            np.testing.assert_array_equal(found, planes[name])
-    assert layers.depth is not None
-    np.testing.assert_array_equal(np.isinf(layers.depth), planes["Z"] == BACKGROUND_DEPTH)
-    assert 0.1 < np.isinf(layers.depth).mean() < 1.0
-
-
 # --------------------------------------------------------------------- of a finished folder
 
 
@@ -760,10 +738,3 @@ def contrast(one: str, other: str) -> float:
 
     low, high = sorted((luminance(one), luminance(other)))
     return (high + 0.05) / (low + 0.05)
-
-
-def test_config_of_a_record_is_the_runs(run: Run) -> None:
-    """Read back from JSON, lists and all."""
-    config = report.config_of(run.record)
-    assert isinstance(config, InsertConfig) and config.placement.place == (0.0, 0.0, -5.0)
-    assert config.render.samples == 4
