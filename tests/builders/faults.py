@@ -36,20 +36,24 @@ KERNELS = str(kernel_store().parent)
 """Where compiled kernels are kept: a child with another home finds them."""
 
 
-NO_TORCH = """
+def refusing(*packages: str) -> str:
+    """Return a hook for `run_case`: packages that are there, and must not be imported."""
+    return f"""
 import sys
 from importlib.machinery import ModuleSpec
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name in ("torch", "warp", "diffusers", "transformers", "peft"):
+        if name in {packages!r}:
             return ModuleSpec(name, self)  # installed, and whether it is may be asked
     def create_module(self, spec):
-        raise AssertionError(spec.name)
+        raise AssertionError(spec.name + " is imported")
     def exec_module(self, module):
         pass
 sys.meta_path.insert(0, Refuse())
 """
-"""A hook for `run_case`: torch and what needs it is there, and must not be imported."""
+
+
+NO_TORCH = refusing("torch", "warp", "diffusers", "transformers", "peft")
 COSTS: list[float] = [0.0, 0.0]
 """Most seconds and bytes that a refused run of this session took."""
 

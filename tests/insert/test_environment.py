@@ -13,7 +13,7 @@ import pytest
 import torch
 import warp as wp
 
-from tests.builders.faults import assert_fails, run_case
+from tests.builders.faults import assert_fails, refusing, run_case
 from tests.builders.insertions import arguments
 from tests.builders.outcome import outcome
 from warpir.app.program import BROUGHT, EXTRA_OF
@@ -243,25 +243,10 @@ def test_missing_package(
     assert lines[1] == f"pip install {advice} brings it"
 
 
-UNUSED = """
-import sys
-from importlib.machinery import ModuleSpec
-for name in [n for n in sys.modules if n.split(".")[0] == "torch"]:
-    del sys.modules[name]
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        return ModuleSpec(name, self) if name == "torch" else None
-    def create_module(self, spec):
-        raise AssertionError("torch is imported")
-sys.meta_path.insert(0, Refuse())
-"""
-"""torch is there, and must not be imported."""
-
-
 def test_run_without_a_model_does_not_import_torch(inputs: Path) -> None:
     """Camera and light are estimated and the picture is written without it: seconds, 200 MB."""
     argv = arguments(inputs, "out", light=None, camera=None, horizon=None, fov=None)
-    ended = run_case(argv, inputs, before=UNUSED)
+    ended = run_case(argv, inputs, before=refusing("torch"))
     assert ended.status == 0, ended.err
     assert "torch is imported" not in ended.err + ended.out
     for needed in ("estimated", "regressor"):
