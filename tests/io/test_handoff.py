@@ -6,8 +6,6 @@ import importlib.util
 import io
 import json
 import os
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +30,7 @@ from tests.builders.insertions import (
     rgb,
     write_inputs,
 )
+from tests.builders.programs.children import output_of
 from tests.builders.programs.llvm import LIBRARY, llvm
 from tests.builders.shapes import box_before, camera
 from tests.io.images.test_envmap_conventions import radiance, read, threejs
@@ -124,15 +123,6 @@ def inputs_of(folder: Path, **changes: object) -> Inputs:
     )
 
 
-def output_of(*command: str, **env: str) -> str:
-    """What a program prints that must end well."""
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, **env}
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 def planes_of(path: Path) -> dict[str, NDArray[np.float64]]:
     pixels, names = read_image(path)
     return {name: pixels[..., k].astype(np.float64) for k, name in enumerate(names)}
@@ -159,22 +149,6 @@ def test_handoff_files_are_listed_and_can_be_left_out(folder: Path, tmp_path: Pa
     assert {p.name for p in plain.iterdir()} == {*ALWAYS, "run.json"} - HANDED
     with pytest.raises(InputError, match="--mitsuba"):
         InsertConfig(mitsuba=True, hand_off=False)
-
-
-def test_handoff_photo_is_upright_and_tells_nothing(folder: Path, tmp_path: Path) -> None:
-    """photo.png has the photo's codes, turned; neither it nor the composite has its EXIF."""
-    codes = np.random.default_rng(2).integers(0, 256, (48, 32, 3), dtype=np.uint8)
-    exif = Image.Exif()
-    exif[0x112], exif[0x10F] = 8, "a maker"
-    exif.get_ifd(0x8825)[1] = "N"
-    Image.fromarray(codes).save(tmp_path / "turned.png", exif=exif)
-    out = tmp_path / "out"
-    go(arguments(folder, out, photo=str(tmp_path / "turned.png"), device="cpu"), out)
-    np.testing.assert_array_equal(read_image(out / "photo.png")[0], np.rot90(codes, 1))
-    for name in ("photo.png", "composite.png"):
-        with Image.open(out / name) as picture:
-            assert dict(picture.getexif()) == {} and "exif" not in picture.info
-        assert b"a maker" not in (out / name).read_bytes()
 
 
 HOSTILE = (
@@ -214,8 +188,12 @@ def test_handoff_takes_no_code_from_names(folder: Path, tmp_path: Path, place: i
 
 @pytest.mark.case("I19")
 def test_handoff_carries_nothing_of_the_photo_but_its_pixels(folder: Path, tmp_path: Path) -> None:
-    """No EXIF, GPS, XMP, text or comment of any photo, in no file; no folder but in run.json."""
+    """No EXIF, GPS, XMP, text or comment of any photo, in no file; no folder but in run.json.
+
+    The pixels are turned as EXIF says.
+    """
     exif = Image.Exif()
+    exif[0x112] = 8
     exif[0x10F], exif[0x9286] = "SECRET maker", b"ASCII\0\0\0SECRET comment"
     exif.get_ifd(0x8825)[1] = "N"
     exif.get_ifd(0x8825)[29] = "SECRET date"
@@ -235,11 +213,15 @@ def test_handoff_carries_nothing_of_the_photo_but_its_pixels(folder: Path, tmp_p
         assert b"SECRET" in file.read_bytes()
         out = tmp_path / file.suffix[1:]
         go(arguments(folder, out, photo=str(file), mitsuba="", device="cpu"), out)
+        for name in ("photo.png", "composite.png"):
+            with Image.open(out / name) as picture:
+                assert dict(picture.getexif()) == {} and "exif" not in picture.info
         for path in (p for p in out.rglob("*") if p.is_file()):
             content = path.read_bytes()
             assert b"SECRET" not in content, path
             assert path.name == "run.json" or b"private place" not in content, path
             assert path.name == "run.json" or str(tmp_path).encode() not in content, path
+    np.testing.assert_array_equal(read_image(tmp_path / "png/photo.png")[0], np.rot90(codes, 1))
 
 
 def test_provenance_is_marked_unless_told_otherwise(folder: Path, tmp_path: Path) -> None:
@@ -475,7 +457,7 @@ def test_blender_shows_the_same_insertion(folder: Path, tmp_path: Path) -> None:
     d = np.concatenate([AROUND, fibonacci(3)])
     z_up = [(float(x), float(-z), float(y)) for x, y, z in d]
     script = folder / "out" / "blender_setup.py"
-    output_of(BLENDER, "-c", DRIVER, str(script), str(tmp_path), repr(z_up))
+    output_of(DRIVER, str(script), str(tmp_path), repr(z_up), python=BLENDER)
     # Light: the map read by the file's own convention, 2 % of reading and of a camera's 0.6 degrees
     texels = read_image(folder / "out" / "envmap.exr")[0]
     x, y, z = d.T
@@ -600,7 +582,7 @@ def test_mitsuba_reads_light_layers_and_scene(folder: Path) -> None:
     """In a process of its own: the real emitter, the real EXR reader, the real scene parser."""
     d = np.concatenate([AROUND, fibonacci(30)])
     out = folder / "out"
-    printed = output_of(sys.executable, "-c", IN_MITSUBA, str(out), json.dumps(d.tolist()))
+    printed = output_of(IN_MITSUBA, str(out), json.dumps(d.tolist()))
     texels = read_image(out / "envmap.exr")[0]
     x, y, z = d.T
     u, v = np.arctan2(x, -z) / (2.0 * np.pi), np.arccos(np.clip(y, -1.0, 1.0)) / np.pi
@@ -637,7 +619,8 @@ def test_mitsuba_renders_our_insertion_to_within_its_noise(folder: Path) -> None
     """``python mitsuba/render.py``: no pixel differs by more than both renderers' noise."""
     out = folder / "out"
     script = str(out / "mitsuba" / "render.py")
-    output_of(sys.executable, script, "--samples", str(SAMPLES), **{LIBRARY: str(llvm())})
+    code = f"import runpy; runpy.run_path({script!r}, run_name='__main__')"
+    output_of(code, "--samples", str(SAMPLES), **{LIBRARY: str(llvm())})
     theirs = planes_of(out / "mitsuba" / "composite.exr")
     first, second = (planes_of(folder / name / "layers.exr") for name in ("out", "again"))
 
@@ -678,7 +661,7 @@ write_composite(Path(sys.argv[1]), Composite(mean, 0.0 * mean), True)
 @pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
 def test_mitsuba_encodes_a_linear_plate_as_the_run_does(tmp_path: Path) -> None:
     """By the sRGB curve, which photos are not linearised by."""
-    output_of(sys.executable, "-c", OF_A_PLATE, str(tmp_path / "o"), **{LIBRARY: str(llvm())})
+    output_of(OF_A_PLATE, str(tmp_path / "o"), **{LIBRARY: str(llvm())})
     encoded = colour.cctf_encoding(np.linspace(0.0, 1.2, 48).clip(max=1.0))
     codes = np.round(255.0 * encoded).reshape(4, 4, 3)
     np.testing.assert_array_equal(read_image(tmp_path / "o.png")[0][..., :3], codes)
@@ -715,7 +698,7 @@ for turn in (np.eye(3), slope):
 @pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
 def test_mitsuba_throws_light_on_sloping_ground() -> None:
     """Turned as a whole under an even sky, a card throws the same light on its ground."""
-    printed = output_of(sys.executable, "-c", ON_A_SLOPE, **{LIBRARY: str(llvm())})
+    printed = output_of(ON_A_SLOPE, **{LIBRARY: str(llvm())})
     level, sloping = map(float, printed.split()[-2:])
     assert sloping == pytest.approx(level, rel=0.05)
 
@@ -747,6 +730,6 @@ for material in (leaning, brushed):
 @pytest.mark.skipif(llvm() is None, reason=f"no LLVM for Mitsuba: name it in {LIBRARY}")
 def test_mitsuba_leans_a_normal_map_along_its_own_coordinates() -> None:
     """A turned texture of anisotropy does not turn the normal map with it."""
-    printed = output_of(sys.executable, "-c", UNDER_A_TURNED_MAP, **{LIBRARY: str(llvm())})
+    printed = output_of(UNDER_A_TURNED_MAP, **{LIBRARY: str(llvm())})
     plain, brushed = map(float, printed.split()[-2:])
     assert brushed == pytest.approx(plain, rel=0.02)
