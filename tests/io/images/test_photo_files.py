@@ -580,19 +580,22 @@ def test_strict_refuses_what_would_be_repaired(tmp_path: Path) -> None:
     fails(write_image(tmp_path / "p.exr", plate), "found 1 such", strict=True)
 
 
-@pytest.mark.case("E9")
-def test_e9_data_window_is_placed_in_the_display_window(tmp_path: Path) -> None:
-    plane = np.arange(1, 17, dtype=np.float32).reshape(4, 4)
+@pytest.mark.parametrize(
+    "read", [lambda path: read_photo(path).codes, read_envmap], ids=["E9-photo", "E9-envmap"]
+)
+def test_data_window_is_placed_in_the_display_window(tmp_path: Path, read: Any) -> None:
+    """With a negative origin, too; around it is nothing."""
+    plane = np.arange(1, 25, dtype=np.float32).reshape(4, 6)
     header = {
         "type": OpenEXR.scanlineimage,
-        "dataWindow": (np.array([-1, 2], np.int32), np.array([2, 5], np.int32)),
-        "displayWindow": (np.array([0, 0], np.int32), np.array([4, 4], np.int32)),
+        "dataWindow": (np.array([-2, 3], np.int32), np.array([3, 6], np.int32)),
+        "displayWindow": (np.array([0, 0], np.int32), np.array([11, 5], np.int32)),
     }
     path = str(tmp_path / "p.exr")
     OpenEXR.File(header, dict.fromkeys("RGB", plane)).write(path)
-    expected = np.zeros((5, 5), np.float32)
-    expected[2:5, 0:3] = plane[0:3, 1:4]
-    np.testing.assert_array_equal(read_photo(path).codes[..., 1], expected)
+    expected = np.zeros((6, 12), np.float32)
+    expected[3:6, 0:4] = plane[0:3, 2:6]
+    np.testing.assert_array_equal(read(path)[..., 1], expected)
 
 
 # ----------------------------------------------------------------------------------- profiles
