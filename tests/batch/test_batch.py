@@ -65,11 +65,10 @@ if any(word.endswith(("--multiprocessing-fork", "/default_worker.py")) for word 
 
 @pytest.fixture
 def memory(tmp_path: Path) -> Iterator[Path]:
-    """A folder in memory, or else an ordinary one."""
-    if not os.access("/dev/shm", os.W_OK):
-        yield tmp_path
-        return
-    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="warpir-batch-") as folder:
+    """A folder in memory, or else an ordinary one, with inputs of an insertion."""
+    where = "/dev/shm" if os.access("/dev/shm", os.W_OK) else tmp_path
+    with tempfile.TemporaryDirectory(dir=where, prefix="warpir-batch-") as folder:
+        write_inputs(Path(folder))
         yield Path(folder)
 
 
@@ -114,7 +113,6 @@ def failures_of(out: Path) -> list[dict[str, Any]]:
 
 def check_batch(memory: Path, hooked: Path, count: int, capsys: Any) -> Path:
     """R16 with so many scenes: one has no photo, the worker of another is killed in it."""
-    write_inputs(memory)
     rows = scenes(count)
     rows[2]["photo"] = "late.png"
     manifest, out = write_manifest(memory, rows), memory / "out"
@@ -195,7 +193,6 @@ assert loaded() == before, loaded() ^ before
 
 def test_nothing_is_left_for_workers_to_compile(memory: Path) -> None:
     """What is compiled before they start is all that a scene loads."""
-    write_inputs(memory)
     argv = [*arguments(memory, memory / "out", samples="1", depth="1"), *FLAGS]
     child = [sys.executable, "-P", "-c", LOADED, *argv]
     ended = subprocess.run(child, capture_output=True, text=True, check=False)
@@ -231,7 +228,6 @@ def running(hooked: Path) -> list[int]:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_batch_that_is_stopped(memory: Path, hooked: Path, number: int) -> None:
     """Its workers end, nothing is half there, and it goes on; also after a kill."""
-    write_inputs(memory)
     argv = [str(write_manifest(memory, scenes(3))), "--out", str(memory / "out"), *FLAGS]
     (hooked / "wait-scene-1").touch()
     process = start([*argv, "--workers", "1"])
@@ -285,7 +281,6 @@ def test_a_killed_guided_scene_goes_on_from_its_checkpoint(memory: Path, hooked:
 @pytest.mark.slow
 def test_a_sequence_is_one_scene(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its frames and its video; paths in its lines start at the manifest; changed, it is redone."""
-    write_inputs(memory)
     argv = arguments(memory, memory / "first", samples="1", depth="1", no_hand_off="", no_detail="")
     assert insert_main([*argv, "--device", "cpu"]) == ExitCode.DONE
     (memory / "bin").mkdir()
@@ -340,7 +335,6 @@ def test_validate_looks_at_all_lines_and_writes_nothing(
     memory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every line that cannot be used is told by its number and its scene."""
-    write_inputs(memory)
     rows: list[object] = list(scenes(4))
     rows[1] = {**scenes(2)[1], "asset": "photo.png"}
     manifest, out = write_manifest(memory, [*rows, "{", {"name": "x", "fotos": 1}]), memory / "out"
@@ -734,7 +728,6 @@ def test_a_batch_on_a_machine_without_the_device(
     memory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """--validate tells the line, and without it the other scene is done."""
-    write_inputs(memory)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     rows = [{**scenes(2)[k], "device": device} for k, device in enumerate(("cuda", "cpu"))]
     argv = [str(write_manifest(memory, rows)), "--out", str(memory / "out"), *FLAGS[:4], *FLAGS[6:]]
@@ -828,7 +821,6 @@ if __name__ == "__main__":
 @pytest.mark.case("R16")
 def test_a_batch_on_a_cluster_of_two_machines(memory: Path, hooked: Path) -> None:
     """A worker is killed, all scenes are done. In a child, since a cluster needs sockets."""
-    write_inputs(memory)
     (hooked / "kill-scene-1").touch()
     (memory / "cluster.py").write_text(CLUSTER)
     argv = [sys.executable, "-P", "cluster.py", str(write_manifest(memory, scenes(4)))]

@@ -2,8 +2,9 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ import torch
 import warp as wp
 
 from tests.builders.faults import Ended, run_case
-from tests.builders.insertions import arguments, read_layers, record_of, write_inputs
+from tests.builders.insertions import arguments, read_layers, record_of
 from tests.builders.outcome import outcome
-from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
 from tests.optimize.test_recover import CHEAP as GUIDED
 from tests.sequence.test_sequence import FAST
+from warpir.kernels import composite, light_gradient, shade
 from warpir.render.determinism import (
     LARGE_PARAMETERS,
     LARGE_THREADS,
@@ -49,15 +50,6 @@ TINY = {
 """A cheap run of each kind."""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photo, box, lights and a tiny Stable Diffusion, made once."""
-    made = tmp_path_factory.mktemp("determinism")
-    write_inputs(made)
-    make_tiny_stable_diffusion(made / "model")
-    return made
-
-
 def argv(folder: Path, kind: str, **changes: str | None) -> list[str]:
     """A run of a kind into ``out`` of the working directory."""
     flags: dict[str, str | None] = dict(TINY[kind])
@@ -87,24 +79,24 @@ def run(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [pytest.param(k, id=f"R13-threads-{k}") for k in TINY])
-def test_threads_change_no_byte(folder: Path, tmp_path: Path, kind: str) -> None:
+def test_threads_change_no_byte(guided_inputs: Path, tmp_path: Path, kind: str) -> None:
     """Every file, whatever --threads and the environment say of threads."""
-    few = run(argv(folder, kind, threads="1"), tmp_path / "few", ONE)
-    many = run(argv(folder, kind, threads="8"), tmp_path / "many", MANY)
+    few = run(argv(guided_inputs, kind, threads="1"), tmp_path / "few", ONE)
+    many = run(argv(guided_inputs, kind, threads="8"), tmp_path / "many", MANY)
     assert len(few) > 15 and many == few
 
 
 @pytest.mark.slow
 @pytest.mark.case("R13")
-def test_threads_change_no_byte_of_a_sequence(folder: Path, tmp_path: Path) -> None:
+def test_threads_change_no_byte_of_a_sequence(guided_inputs: Path, tmp_path: Path) -> None:
     """Both frames, lit by an earlier run."""
-    lines = folder / "frames.jsonl"
+    lines = guided_inputs / "frames.jsonl"
     lines.write_text('{}\n{"place": [0.3, 0, -5]}\n')
-    first = arguments(folder, folder / "first", **FAST)
-    assert run_case(first, folder).status == 0
-    flags = {**FAST, "light": None, "reuse": str(folder / "first"), "sequence": str(lines)}
-    few = run(arguments(folder, "out", **flags, threads="1"), tmp_path / "few", ONE)
-    many = run(arguments(folder, "out", **flags, threads="8"), tmp_path / "many", MANY)
+    first = arguments(guided_inputs, guided_inputs / "first", **FAST)
+    assert run_case(first, guided_inputs).status == 0
+    flags = {**FAST, "light": None, "reuse": str(guided_inputs / "first"), "sequence": str(lines)}
+    few = run(arguments(guided_inputs, "out", **flags, threads="1"), tmp_path / "few", ONE)
+    many = run(arguments(guided_inputs, "out", **flags, threads="8"), tmp_path / "many", MANY)
     assert len(few) > 20 and many == few
 
 
@@ -147,10 +139,10 @@ def test_arithmetic_comes_back_after_an_error() -> None:
 
 @pytest.mark.slow
 @pytest.mark.case("R13")
-def test_kinds_of_processors_agree(folder: Path, tmp_path: Path) -> None:
+def test_kinds_of_processors_agree(guided_inputs: Path, tmp_path: Path) -> None:
     """With AVX-512 and without, the light that is read off the photo gives the same image."""
-    run(argv(folder, "regressed"), tmp_path / "all", ONE)
-    run(argv(folder, "regressed"), tmp_path / "lower", {**ONE, **LOWER})
+    run(argv(guided_inputs, "regressed"), tmp_path / "all", ONE)
+    run(argv(guided_inputs, "regressed"), tmp_path / "lower", {**ONE, **LOWER})
     ours, theirs = (
         read_layers(tmp_path / name / "out" / "layers.exr") for name in ("all", "lower")
     )
@@ -192,17 +184,17 @@ time.localtime = lambda seconds=None: time.localtime_of(0 if seconds is None els
     ],
 )
 def test_clock_changes_no_byte(
-    folder: Path, tmp_path: Path, env: dict[str, str], before: str, plain: dict[str, str]
+    guided_inputs: Path, tmp_path: Path, env: dict[str, str], before: str, plain: dict[str, str]
 ) -> None:
     """No file holds a date, and nothing waits for a clock that goes backwards."""
-    settled = "import time; time.tzset()" if env else ""
-    assert run(argv(folder, "regressed"), tmp_path / "a", env, f"{settled}\n{before}") == plain
+    before = f"{'import time; time.tzset()' if env else ''}\n{before}"
+    assert run(argv(guided_inputs, "regressed"), tmp_path / "a", env, before) == plain
 
 
 @pytest.fixture(scope="module")
-def plain(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def plain(guided_inputs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The result of a plain run, somewhere with a clock that goes as it should."""
-    yield run(argv(folder, "regressed"), tmp_path_factory.mktemp("plain") / "a")
+    return run(argv(guided_inputs, "regressed"), tmp_path_factory.mktemp("plain") / "a")
 
 
 # A GPU, on request
@@ -211,10 +203,10 @@ def plain(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[di
 @pytest.mark.slow
 @pytest.mark.case("R13")
 def test_deterministic_is_accepted_on_the_cpu(
-    folder: Path, tmp_path: Path, plain: dict[str, str]
+    guided_inputs: Path, tmp_path: Path, plain: dict[str, str]
 ) -> None:
     """It changes nothing there; run.json and the layers' header say that it was asked for."""
-    found = run(argv(folder, "regressed", deterministic="", device="cpu"), tmp_path / "a")
+    found = run(argv(guided_inputs, "regressed", deterministic="", device="cpu"), tmp_path / "a")
     differing = {name for name in plain if found[name] != plain[name]}
     assert differing == {"layers.exr", "report.html", "run.json"}
     assert record_of(tmp_path / "a/out")["config"]["deterministic"] is True
@@ -232,57 +224,51 @@ def test_deterministic_is_accepted_on_the_cpu(
     ],
 )
 def test_deterministic_repeats_its_bytes_on_a_gpu(
-    folder: Path, tmp_path: Path, kind: str, changes: dict[str, str]
+    guided_inputs: Path, tmp_path: Path, kind: str, changes: dict[str, str]
 ) -> None:
     """Two runs with --deterministic, each in a process of its own with empty caches."""
-    flags = argv(folder, kind, deterministic="", device="cuda:0", **changes)
+    flags = argv(guided_inputs, kind, deterministic="", device="cuda:0", **changes)
     first, second = (run(flags, tmp_path / name) for name in ("a", "b"))
     assert first == second
     record = record_of(tmp_path / "a/out")
     assert record["config"]["deterministic"] is True and record["device"].startswith("cuda")
 
 
+ORDERED, ROOM = "deterministic", "deterministic_max_records"
+"""Options of Warp's modules."""
+
+
+@pytest.fixture(params=[composite, light_gradient, shade], ids=lambda module: module.__name__)
+def module(request: pytest.FixtureRequest) -> ModuleType:
+    """Kernels that add in common places; compiling them for CUDA needs no GPU."""
+    if not wp._src.context.runtime.nvrtc_supported_archs:
+        pytest.skip("Warp has no CUDA compiler here")
+    return request.param
+
+
 @pytest.mark.case("R13")
-def test_every_kernel_that_adds_in_common_places_can_be_ordered() -> None:
-    """Warp refuses to order what also reads the sums; compiling for CUDA says so without a GPU."""
-    import tempfile
-
-    from warpir.kernels import composite, light_gradient, shade
-
-    if not wp._src.context.runtime.nvrtc_supported_archs:
-        pytest.skip("Warp has no CUDA compiler here")
-    for module in (composite, light_gradient, shade):
-        before = dict(wp.get_module_options(module))
-        wp.set_module_options(
-            {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": 16},
-            module,
-        )
-        try:
-            with tempfile.TemporaryDirectory() as out:
-                wp.compile_aot_module(module, arch=80, module_dir=out, use_ptx=True)
-                assert list(Path(out).glob("*.ptx"))
-        finally:
-            names = ("deterministic", "deterministic_max_records")
-            wp.set_module_options({name: before[name] for name in names}, module)
+def test_every_kernel_that_adds_in_common_places_can_be_ordered(
+    module: ModuleType, tmp_path: Path
+) -> None:
+    """Warp refuses to order what also reads the sums, and says so when it compiles."""
+    options = wp.get_module_options(module)
+    before = {name: options[name] for name in (ORDERED, ROOM)}
+    wp.set_module_options({ORDERED: wp.DeterministicMode.RUN_TO_RUN, ROOM: 16}, module)
+    try:
+        wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
+        assert list(tmp_path.glob("*.ptx"))
+    finally:
+        wp.set_module_options(before, module)
 
 
-def test_only_additions_in_loops_need_room_to_spare() -> None:
+def test_only_additions_in_loops_need_room_to_spare(module: ModuleType, tmp_path: Path) -> None:
     """Warp counts those outside of loops itself; more room than they need is some gigabytes."""
-    import tempfile
-
-    from warpir.kernels import composite, light_gradient, shade
-
-    if not wp._src.context.runtime.nvrtc_supported_archs:
-        pytest.skip("Warp has no CUDA compiler here")
-    names = ("deterministic", "deterministic_max_records")
     _order_kernels(is_deterministic=True)
     try:
-        for module in (composite, light_gradient, shade):
-            with tempfile.TemporaryDirectory() as out:
-                wp.compile_aot_module(module, arch=80, module_dir=out, use_ptx=True)
-                source = next(Path(out).glob("*.cu")).read_text()
-            loops = re.findall(r"start_for_(\d+):;(.*?)end_for_\1:;", source, re.DOTALL)
-            has_loop = any("WP_DET_SCATTER" in body for _, body in loops)
-            assert has_loop == (wp.get_module_options(module)[names[1]] > 0)
+        wp.compile_aot_module(module, arch=80, module_dir=tmp_path, use_ptx=True)
+        source = next(tmp_path.glob("*.cu")).read_text()
+        loops = re.findall(r"start_for_(\d+):;(.*?)end_for_\1:;", source, re.DOTALL)
+        has_loop = any("WP_DET_SCATTER" in body for _, body in loops)
+        assert has_loop == (wp.get_module_options(module)[ROOM] > 0)
     finally:
         _order_kernels(is_deterministic=False)

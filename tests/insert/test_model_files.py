@@ -20,8 +20,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from tests.builders.faults import NO_TORCH, assert_fails, run_case
-from tests.builders.insertions import arguments, write_inputs
-from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.builders.insertions import arguments
 from tests.lighting.test_regressor import SMALL
 from warpir.app.config import InsertConfig
 from warpir.app.record import input_files
@@ -42,14 +41,11 @@ def adapter(prefix: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def inputs(guided_inputs: Path) -> Path:
     """Inputs of a run, a model's folder, and a good file of each kind; never changed."""
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    make_tiny_stable_diffusion(folder / "model")
-    save_file(adapter("unet"), folder / "lora.safetensors")
-    save_regressor(random_regressor(0, SMALL), folder / "regressor.safetensors", {})
-    return folder
+    save_file(adapter("unet"), guided_inputs / "lora.safetensors")
+    save_regressor(random_regressor(0, SMALL), guided_inputs / "regressor.safetensors", {})
+    return guided_inputs
 
 
 def run_with(inputs: Path, flag: str, file: Path | str) -> list[str]:
@@ -161,28 +157,21 @@ def describe(key: str, text: str) -> Callable[[Path], None]:
 
 def configured(**changes: object) -> Callable[[Path], None]:
     """Change what the header says of the network."""
-
-    def change(tensors: dict[str, Any], about: dict[str, str]) -> None:
-        about["config"] = json.dumps({**json.loads(about["config"]), **changes})
-
-    return edited(change)
+    return edited(lambda tensors, about: restate(about, **changes))
 
 
-def as_written(spoil: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    """Change weights, and the hash of them too."""
+def restate(about: dict[str, str], **changes: object) -> None:
+    about["config"] = json.dumps(json.loads(about["config"]) | changes)
+
+
+def as_written(
+    spoil: Callable[[dict[str, Any]], object] = lambda tensors: None, **changes: object
+) -> Callable[[Path], None]:
+    """Change weights, or what the header says of the network, and the hash of them too."""
 
     def change(tensors: dict[str, Any], about: dict[str, str]) -> None:
         spoil(tensors)
-        about["weights"] = values_hash(tensors, about["config"])
-
-    return edited(change)
-
-
-def resized(**sizes: object) -> Callable[[Path], None]:
-    """State other sizes than the weights have, and hash them as if they were true."""
-
-    def change(tensors: dict[str, Any], about: dict[str, str]) -> None:
-        about["config"] = json.dumps(json.loads(about["config"]) | sizes)
+        restate(about, **changes)
         about["weights"] = values_hash(tensors, about["config"])
 
     return edited(change)
@@ -192,7 +181,7 @@ def resized(**sizes: object) -> Callable[[Path], None]:
 def test_sizes_that_the_weights_do_not_have_are_refused(
     inputs: Path, tmp_path: Path, sizes: dict[str, object]
 ) -> None:
-    refused(inputs, tmp_path, "regressor", resized(**sizes), "not those of its network")
+    refused(inputs, tmp_path, "regressor", as_written(**sizes), "not those of its network")
 
 
 def test_answers_that_are_no_light_are_refused(inputs: Path, tmp_path: Path) -> None:
