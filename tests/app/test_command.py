@@ -20,6 +20,7 @@ from PIL import Image
 
 import warpir.app.command
 import warpir.insert
+from tests.builders.insertions import LOBES
 from tests.builders.refusals import assert_fails, refused
 from warpir.app.command import BY_HAND, FLAGS, parse
 from warpir.app.config import DEFAULTS, EXCLUSIVE, OPTIONS, InsertConfig, flag
@@ -757,11 +758,6 @@ def test_command_refuses_inputs_that_a_result_could_replace(
 
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
-LOBES = {
-    "format": "warpir-lobes",
-    "version": 1,
-    "lobes": [{"amplitude": [1, 2, 3], "axis": [0, 2, 0], "sharpness": 5}],
-}
 
 
 @pytest.fixture

@@ -451,33 +451,26 @@ def test_yaml_at_its_limit_is_read_in_time(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ what works although it is odd
 
 
-@pytest.mark.parametrize(
-    ("flag", "make"),
-    [
-        ("photo", lambda path: os.mkfifo(path)),
-        ("photo", lambda path: path.symlink_to(path)),
-        ("asset", lambda path: os.mkfifo(path)),
-        ("light", lambda path: path.symlink_to("/dev/zero")),
-        ("occluder_mask", lambda path: path.symlink_to("/dev/zero")),
-        ("materials", lambda path: os.mkfifo(path)),
-        ("camera", lambda path: os.mkfifo(path)),
-        ("config", lambda path: path.symlink_to("/dev/zero")),
-    ],
-    ids=[
-        "I18-fifo",
-        "I18-link-loop",
-        "I18-asset-fifo",
-        "I18-light-device",
-        "I18-mask-device",
-        "I18-materials-fifo",
-        "I18-camera-fifo",
-        "I18-config-device",
-    ],
-)
-def test_what_is_no_file_is_never_opened(
-    flag: str, make: Callable[[Path], None], inputs: Path, tmp_path: Path
-) -> None:
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+NO_FILES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "I18-fifo": ("photo", os.mkfifo),
+    "I18-link-loop": ("photo", lambda path: path.symlink_to(path)),
+    "I18-asset-fifo": ("asset", os.mkfifo),
+    "I18-light-device": ("light", endless),
+    "I18-mask-device": ("occluder_mask", endless),
+    "I18-materials-fifo": ("materials", os.mkfifo),
+    "I18-camera-fifo": ("camera", os.mkfifo),
+    "I18-config-device": ("config", endless),
+}
+
+
+@pytest.mark.parametrize("case", NO_FILES)
+def test_what_is_no_file_is_never_opened(case: str, inputs: Path, tmp_path: Path) -> None:
     """Nobody writes into the pipe and the device has no end: a reader would wait for ever."""
+    flag, make = NO_FILES[case]
     name = "x.glb" if flag == "asset" else "x.json" if flag == "materials" else "x.png"
     make(tmp_path / name)
     pose = NO_POSE if flag == "camera" else {}

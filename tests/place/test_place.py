@@ -10,13 +10,14 @@ import pytest
 import trimesh
 
 from tests.builders.programs.placing import EXACT, HEIGHT, TILTED, WIDTH, begun
+from tests.builders.shapes import a_camera
 from warpir.app.config import InsertConfig
 from warpir.core.errors import ExitCode, InputError
 from warpir.io.assets import load_asset
 from warpir.place.preview_asset import preview_asset, triangle_count
 from warpir.place.session import PlacementFolder, placement_files
 from warpir.place.stance import Stance, ground_to_world, stance_of
-from warpir.scene.camera import Camera, CameraEstimate, camera_from_fov
+from warpir.scene.camera import Camera, camera_from_fov
 from warpir.scene.placement import place_asset
 
 # What is sent for a placement, from what the page starts with.
@@ -142,17 +143,7 @@ def test_page_starts_with_the_estimated_camera(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers, and that they are estimates; a camera that sees no ground gives way."""
-    found = CameraEstimate(
-        pitch_deg=-8.0,
-        roll_deg=3.0,
-        vfov_deg=40.0,
-        principal=(0.5, 0.5),
-        pitch_sigma_deg=2.0,
-        roll_sigma_deg=2.0,
-        vfov_sigma_deg=2.0,
-        principal_sigma=(0.1, 0.1),
-        witnesses=("network",),
-    )
+    found = a_camera(pitch_deg=-8.0, roll_deg=3.0, vfov_deg=40.0)
     photo, asset = str(inputs / "photo.png"), str(inputs / "wedge.glb")
     config = InsertConfig(photo=photo, asset=asset, out=str(tmp_path / "o"))
     monkeypatch.setattr("warpir.place.session.estimate_photo", lambda *_: found)
