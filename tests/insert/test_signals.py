@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from tests.builders.faults import Ended, run_case, snapshot
+from tests.builders.faults import Ended, assert_fails, run_case, snapshot
 from tests.builders.guided_runs import guided_argv, old_results, results_of
 from tests.builders.insertions import arguments
 from warpir.core import signals
@@ -492,22 +492,9 @@ def test_resume_refuses_a_changed_file_with_both_sha256(stopped: Path, tmp_path:
     words = (f'inputs.asset: was "{before}", is "{sha256(file)}"', "000004-optimize-3")
     try:
         argv = [*guided_argv(stopped / "inputs"), "--resume"]
-        fails_warm(argv, ExitCode.INPUT, *words, cwd=run)
+        assert_fails(argv, ExitCode.INPUT, *words, cwd=run, warm=True)
     finally:
         file.write_bytes(content)
-
-
-def fails_warm(argv: list[str], code: int, *words: str, cwd: Path) -> list[str]:
-    """Check a refusal that comes after the model is loaded: seconds, but no limit on memory."""
-    before = snapshot(cwd)
-    ended = run_case(argv, cwd, warm=True)
-    lines = ended.err.splitlines()
-    assert ended.status == code, ended
-    assert lines[0].startswith("error: ") and "Traceback" not in ended.err
-    assert all(word in lines[0] for word in words), lines[0]
-    assert snapshot(cwd) == before
-    assert not ended.left and not ended.children and ended.seconds < 10.0
-    return lines
 
 
 @pytest.mark.slow
@@ -526,7 +513,8 @@ def test_resume_goes_back_to_the_checkpoint_before(stopped: Path, tmp_path: Path
     assert "resumed: optimize, step 2" in ended.out
     for checkpoint in (folder / "out" / "checkpoints").iterdir():
         cut(checkpoint)
-    fails_warm(argv, ExitCode.INPUT, "out/checkpoints", "cannot be used", cwd=folder)
+    words = "out/checkpoints", "cannot be used"
+    assert_fails(argv, ExitCode.INPUT, *words, cwd=folder, warm=True)
     assert earlier.name < newest.name
 
 
