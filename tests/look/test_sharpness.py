@@ -96,6 +96,15 @@ def test_part_with_few_steps_asks_the_whole_photo() -> None:
     assert estimate_blur(image, part) == estimate_blur(image)
 
 
+def test_texture_tells_where_no_step_does() -> None:
+    """Of detail that is too faint for an edge: some blur, as a lens has, and 1 px at most."""
+    noise = np.random.default_rng(2).normal(size=(160, 240))
+    faint = 0.004 * sum(ndimage.gaussian_filter(noise, s) * s for s in (0.6, 1.2, 2.4, 4.8))
+    found = estimate_blur(np.repeat(0.5 + faint[..., None], 3, axis=2))
+    assert found is not None and found.edges == 0
+    assert 0.1 < np.sqrt(found.sigma**2 - PIXEL_SIGMA**2) < 1.001
+
+
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_no_edges_tell_nothing(value: float) -> None:
     """An even picture, black and white ones too."""

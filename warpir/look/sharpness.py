@@ -33,6 +33,9 @@ of the blur, the texture the other half [px]."""
 WEAK = 0.2
 """Median contrast of the steps at which their spread counts twice [1]: clouds, haze and shadows are
 weak, and soft by themselves."""
+MOST_BY_TEXTURE = 1.0
+"""Blur that is believed of a photo without steps [px]: that of a clear sky or a bare wall is read
+too large."""
 LEAST_CONTRAST = 0.03
 """Luminance step over the photo's 99th percentile from which an edge counts [1]."""
 SOFT, BROAD, WIDER = 1.2, 2.5, 1.25
@@ -62,7 +65,7 @@ def estimate_blur(
     region: BoolArray | None = None,
     texture: Callable[[], Texture] | None = None,
 ) -> EdgeBlur | None:
-    """Estimate the blur of the lens, by edges and, where they do not agree, by the texture.
+    """Estimate the blur of the lens, by edges and, where they do not agree or are few, by texture.
 
     A step of height A behind a Gaussian of deviation s has, seen through a Gaussian derivative of
     deviation t, the largest slope ``A / sqrt(2 pi (s^2 + t^2))``; the ratio R of two such slopes
@@ -76,14 +79,26 @@ def estimate_blur(
         texture: Gives what is read of the texture there, if that is known.
 
     Returns:
-        The blur, or None where the photo has too few edges.
+        The blur, or None where the photo has no texture either, or is smaller than `SMALLEST`.
     """
+    found = _by_steps(linear, region, texture)
+    if found is None and min(linear.shape[:2]) >= SMALLEST and np.ptp(linear) > 0.0:
+        told = min((texture() if texture else read_texture(linear, region)).blur, MOST_BY_TEXTURE)
+        return EdgeBlur(math.hypot(told, PIXEL_SIGMA), 0)
+    return found
+
+
+def _by_steps(
+    linear: AnyFloatArray, region: BoolArray | None, texture: Callable[[], Texture] | None
+) -> EdgeBlur | None:
+    """Return the blur where there are steps, of a very soft photo that at half its size."""
     found = _blur_at_size(linear, region, texture)
     if found is None or found.sigma < SOFT or min(linear.shape[:2]) < 4 * SMALLEST:
         return found
     height, width = (side // 2 * 2 for side in linear.shape[:2])
     tiles = linear[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
-    half = estimate_blur(tiles.mean(axis=(1, 3)), None if region is None else region[1::2, 1::2])
+    seen = None if region is None else region[1::2, 1::2]
+    half = _by_steps(tiles.mean(axis=(1, 3)), seen, None)
     # Its pixel is as wide as two.
     sigma = 0.0 if half is None else math.sqrt(4.0 * half.sigma**2 - 3.0 * PIXEL_SIGMA**2)
     if half is None or sigma < max(BROAD, WIDER * found.sigma):
