@@ -328,6 +328,9 @@ NO_WEBGL = """const get = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
   return kind.startsWith("webgl") ? null : get.call(this, kind, ...more);
 };"""
+NO_STORAGE = """function refuse() { throw new DOMException("refused", "SecurityError"); }
+Object.defineProperty(window, "sessionStorage", { get: refuse });
+window.BroadcastChannel = refuse;"""
 
 
 @needs_chromium
@@ -395,6 +398,17 @@ def test_second_tab_is_told_of_a_save(inputs: Path, tmp_path: Path) -> None:
             told.page.bring_to_front()
             told.page.wait_for_selector("text=Another tab has saved")
             told.page.wait_for_selector("#done", state="hidden")
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_page_does_without_storage(inputs: Path, tmp_path: Path) -> None:
+    """A browser that refuses it refuses channels between tabs too: the page stayed empty."""
+    with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
+        opened.page.add_init_script(NO_STORAGE)
+        opened.page.goto(served.address)
+        opened.page.wait_for_selector("#save:not([disabled])", timeout=60_000)
+        save(opened)
 
 
 @needs_chromium

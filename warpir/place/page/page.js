@@ -337,7 +337,7 @@ function showSaved(sent, command) {
   $('command').textContent = command;
   saved = sent;
   draw();
-  others.postMessage('saved');
+  others?.postMessage('saved');
 }
 
 async function save() {
@@ -362,12 +362,15 @@ async function save() {
 const KEPT = `placing ${location.pathname}`;
 
 // Another tab of this session saves into the same file.
-const others = new BroadcastChannel(KEPT);
-others.onmessage = () => {
-  saved = null;
-  draw();
-  tell('Another tab has saved its placement; a save here replaces that.');
-};
+let others = null;
+try {
+  others = new BroadcastChannel(KEPT);
+  others.onmessage = () => {
+    saved = null;
+    draw();
+    tell('Another tab has saved its placement; a save here replaces that.');
+  };
+} catch { /* refused with storage: then no tab is told */ }
 
 function keep() {
   try {
