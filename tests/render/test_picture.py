@@ -15,7 +15,7 @@ from warpir.core.arrays import CodeArray, Int64Array
 from warpir.io.images.photos import Photo
 from warpir.io.images.resize import resize
 from warpir.look.camera_look import CameraLook
-from warpir.look.denoise import denoiser_version
+from warpir.look.denoise import denoised_ratio, denoiser_version
 from warpir.look.grain import Grain
 from warpir.look.response import Response
 from warpir.look.sharpness import EdgeBlur
@@ -24,6 +24,7 @@ from warpir.render.composite import Picture, make_picture
 from warpir.render.device_light import light_args
 from warpir.render.device_scene import Scene
 from warpir.render.integrator import Radiance
+from warpir.render.picture import planes
 from warpir.render.picture.light_preview import balls
 from warpir.render.picture.quality import Quality
 from warpir.render.picture.resizing import resize_planes
@@ -282,8 +283,17 @@ def test_blur_response_and_grain_recompose(device: str) -> None:
 
 
 @pytest.mark.skipif(denoiser_version() is None, reason="pyoidn is not installed")
-def test_denoised_picture_is_nearer_to_the_truth(device: str) -> None:
-    """Less error on object and shadow; layers recompose, parts add up, other pixels keep codes."""
+def test_denoised_picture_is_nearer_to_the_truth(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Less error on object and shadow; layers recompose, parts add up, other pixels keep codes.
+
+    The shadow's filter is told which pixels the object fills.
+    """
+    filled = []
+    monkeypatch.setattr(
+        planes, "denoised_ratio", lambda *a: filled.append(a[2]) or denoised_ratio(*a)
+    )
 
     def final(samples: int, is_denoised: bool) -> Picture:
         quality = replace(QUALITY, samples=samples, is_denoised=is_denoised)
@@ -294,6 +304,7 @@ def test_denoised_picture_is_nearer_to_the_truth(device: str) -> None:
         before, after = (np.abs(p.image - truth.image)[where].mean() for p in (noisy, clean))
         assert after < before
     layers = clean.layers
+    np.testing.assert_array_equal(filled[0], np.flatnonzero(layers.matte == 1.0))
     parts = layers.diffuse + layers.specular + layers.emission
     np.testing.assert_allclose(parts, layers.foreground[..., :3], atol=1e-3)
     codes = photo().encode(clean.image, clean.changed)
