@@ -4,6 +4,7 @@ Scenes are real and small. They are written to memory where the system has such 
 tested is not the disk, which waits for every file of every scene.
 """
 
+import errno
 import hashlib
 import importlib.util
 import json
@@ -329,6 +330,23 @@ def test_a_failed_scene_tells_of_an_earlier_result(
     ]
     listed = (tmp_path / "out" / "failures.jsonl").read_text().splitlines()
     assert [told in json.loads(line)["more"] for line in listed] == [True, False]
+
+
+def test_a_folder_of_another_user_ends_no_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it holds cannot be told; the other lines go on."""
+    stat = os.stat
+
+    def refusing(path: Any, **given: Any) -> os.stat_result:
+        if str(path).endswith("out/a/run.json"):
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return stat(path, **given)
+
+    monkeypatch.setattr(os, "stat", refusing)
+    manifest = write_manifest(tmp_path, [{"name": "a", "fotos": 1}, {"name": "b", "fotos": 1}])
+    assert main([str(manifest), "--out", str(tmp_path / "out"), *FLAGS]) == ExitCode.USAGE
+    assert "2 of 2 scenes failed" in capsys.readouterr().err
 
 
 def test_validate_looks_at_all_lines_and_writes_nothing(

@@ -1,5 +1,6 @@
 """A line of a batch's manifest on its way: what became of it, and why."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +55,8 @@ class Scene:
         line = f"line {self.row.line}{f', {self.row.name}' if self.row.name else ''}"
         say(f"{line}: failed ({self.status}): {self.reason}")
         folder = self.out / str(self.row.name)
-        if any((folder / name).exists() for name in ("run.json", "sequence.json")):
+        # Not Path.exists, which raises where the folder is another user's.
+        if any(os.path.exists(folder / name) for name in ("run.json", "sequence.json")):
             self.lines += (f"{folder} holds the result of an earlier run",)
             say(f"notice: {self.lines[-1]}")
 
