@@ -21,10 +21,10 @@ FINE, COARSE, WIDE = 1.0, 2.0, 3.0
 the third tells steps from lines and from crowded edges."""
 CLEAR, FAINT = (10.0, 0.06, 60), (6.0, 0.15, 20)
 """Least slope over the noise's, how far the third slope may be from that of a step [1], and steps
-below which a photo tells no blur: of clear edges, and of the fainter ones that count where these
+below which they tell no blur: of clear edges, and of the fainter ones that count where these
 are too few."""
 AROUND = 100
-"""Clear steps below which a part of a photo tells no blur, and the whole photo is asked."""
+"""Clear steps below which a part of a photo tells none, and the whole photo is asked."""
 LENS = 0.4
 """Quantile of the blurs of all steps that counts as the lens's: many edges of a scene are soft."""
 LOW, HIGH, SPREAD = 0.15, 0.6, 0.33

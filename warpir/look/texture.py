@@ -3,8 +3,8 @@
 Blur takes fine detail and leaves coarse; grain comes after it, so that no blur takes it. How much
 detail a scene had nobody knows, but scenes are alike: so small networks, which have seen places and
 pictures through known cameras, read the statistics of the photo's bands (`python -m
-benchmarks.sharpness --fit` trained them). The lens's blur is asked where edges do not agree on it,
-the strength of the grain always: what flat patches show is grain or asphalt.
+benchmarks.sharpness --fit` trained them). The lens's blur is asked where edges are few or do not
+agree on it, the strength of the grain always: what flat patches show is grain or asphalt.
 """
 
 from __future__ import annotations

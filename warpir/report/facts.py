@@ -354,7 +354,7 @@ def _look(look: Mapping[str, Any]) -> Rows:
             text += f"; the photo's blacks are at code {255.0 * response['black']:.0f}"
         rows.append(("response of the object, as of the photo", text))
     if blur := look.get("blur"):
-        rows.append(("blur of the object, as of the photo's edges", f"{blur['sigma']:.2f} px"))
+        rows.append(("blur of the object, as of the photo", f"{blur['sigma']:.2f} px"))
     if grain := look.get("grain"):
         weakest, strongest = (255.0 * f(map(f, grain["strength"])) for f in (min, max))
         text = f"{weakest:.1f} to {strongest:.1f} codes of 255, {grain['size']:.1f} px wide"
