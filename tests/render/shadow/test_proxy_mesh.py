@@ -427,8 +427,11 @@ def test_first_hit_is_that_of_the_kernels(device: str) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 16, 17, 700])
-def test_first_hit_is_the_nearest_of_all_triangles(count: int) -> None:
+def test_first_hit_is_the_nearest_of_all_triangles(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Corners on a lattice: rays run within sides of boxes, and meet triangles at shared edges."""
+    monkeypatch.setattr(receiver, "CHUNK", 8 * receiver.WIDTH)  # as of more rays and triangles
     rng = np.random.default_rng(count)
     corners = rng.integers(-3, 4, (30, 3)).astype(np.float64)
     soup = ReceiverMesh(corners, rng.integers(0, 30, (count, 3)).astype(np.int32))
