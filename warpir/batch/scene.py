@@ -52,12 +52,13 @@ class Scene:
         # A signal that came to this scene alone is none of the batch's.
         self.status = status if status < 128 else ExitCode.RESOURCES
         self.state, self.lines = "failed", tuple(lines)
-        line = f"line {self.row.line}{f', {self.row.name}' if self.row.name else ''}"
-        say(f"{line}: failed ({self.status}): {self.reason}")
-        folder = self.out / str(self.row.name)
+        name = self.row.name
+        say(f"line {self.row.line}{f', {name}' if name else ''}: failed "
+            f"({self.status}): {self.reason}")  # fmt: skip
+        files = ("run.json", "sequence.json")
         # Not Path.exists, which raises where the folder is another user's.
-        if any(os.path.exists(folder / name) for name in ("run.json", "sequence.json")):
-            self.lines += (f"{folder} holds the result of an earlier run",)
+        if name and any(os.path.exists(self.out / name / file) for file in files):
+            self.lines += (f"{self.out / name} holds the result of an earlier run",)
             say(f"notice: {self.lines[-1]}")
 
     @property
