@@ -92,12 +92,23 @@ def test_grey_photo_without_flat_patches_has_the_told_grain(
     assert grain is not None and 255.0 * grain.typical == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("codes", [16.0, 24.0])
+@pytest.mark.parametrize("codes", [10.0, 16.0, 24.0])
 def test_heavy_grain_is_that_of_flat_patches(codes: float) -> None:
     """The texture tells no more than about 4 codes of any; within a tenth."""
     photo = noisy(Grain((0.5,), ((codes / 255.0,) * 3,), 0.4, 0.5)).astype(np.float32)
     found = estimate_look(photo, gamma_to_linear(photo), None, "off").grain
     assert found is not None and 255.0 * found.typical == pytest.approx(codes, rel=0.1)
+
+
+def test_texture_of_some_levels_is_no_heavy_grain() -> None:
+    """Rock and leaves look as grainy, but dark water among them does not; grain is everywhere."""
+    rock = Grain((0.1, 0.4, 0.6), ((0.009,) * 3, (0.05,) * 3, (0.055,) * 3), 0.6, 0.95)
+    told = as_told(rock, 3.5 / 255.0)
+    assert told is not None and 255.0 * told.of_luminance == pytest.approx(3.5)
+    grainy = replace(rock, strength=((0.04,) * 3, (0.05,) * 3, (0.055,) * 3))
+    found = as_told(grainy, 3.5 / 255.0)
+    assert found is not None and found.strength[:2] == grainy.strength[:2]
+    assert found.strength[2] == pytest.approx((EXCESS * 0.04,) * 3)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])

@@ -47,9 +47,10 @@ the noise of a sensor changes little over the display values of a picture. Also 
 tells over flat patches (`as_told`)."""
 WIDEST = 2.0
 """Largest standard deviation of the blur that stands for the grain's size [px]."""
-HEAVY = (3.0 / 255.0, 10.0 / 255.0)
-"""Luminance's grain by the texture and by flat patches beyond which these count [1]: the networks
-have seen up to 6 codes, and tell 4 of all that is stronger."""
+HEAVY = (3.0 / 255.0, 6.0 / 255.0)
+"""Luminance's grain by the texture, and by flat patches of the level with the least of it, beyond
+which flat patches count [1]: the networks have seen up to 6 codes, and tell 4 of all that is
+stronger. Rock and leaves look like grain as heavy, but not at every level."""
 NEAR = 32
 """What is farther off changes nothing in JPEG [px]: two blocks of subsampled chroma."""
 
@@ -187,13 +188,19 @@ def as_told(
 
     Args:
         grain: That of flat patches, whose levels, channels and size are kept, its median level
-            at the strength, but for one beyond `HEAVY`; None: without any.
+            at the strength, but for one beyond `HEAVY`, whose strengths are kept up to `EXCESS` of
+            the least; None: without any.
         luminance: Standard deviation of the luminance [1].
         is_grey: Whether the photo's channels are equal, and so is what is not known of its grain.
         is_recoded: Whether `blocks_over` comes after it, and takes off what the file's coding did.
     """
-    if grain and luminance > HEAVY[0] and grain.of_luminance > HEAVY[1]:
-        return grain
+    if grain and luminance > HEAVY[0]:
+        least = min(grain.strength, key=sum)
+        if float(np.mean(least)) * grain.luminance_share > HEAVY[1]:
+            table = np.minimum(grain.strength, EXCESS * np.asarray(least))
+            return replace(
+                grain, strength=tuple((float(r), float(g), float(b)) for r, g, b in table)
+            )
     found = grain or Grain((0.5,), ((LEAST,) * 3,), 0.0, float(is_grey))
     # Not that in the middle of the range, where a posterised picture may have none.
     median = float(np.median(np.mean(found.strength, axis=1))) * found.luminance_share
