@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from warpir.lighting.scene_light import SceneLight
     from warpir.optimize.find_light import LitRun
     from warpir.report.result import RenderedResult
+    from warpir.sequence.look import FirstLook
 
 __all__ = ["InsertConfig", "Insertion", "insert", "main"]
 
@@ -99,7 +100,9 @@ def insert(config: InsertConfig, *, renews: bool = False) -> Insertion:
             raise
 
 
-def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Insertion:
+def _insert_one(
+    config: InsertConfig, loaders: "Loaders | None" = None, first: "FirstLook | None" = None
+) -> Insertion:
     """Insert into one photograph: read, find the light, render, write."""
     from warpir.app.inputs import Loaders
     from warpir.calibration.photos import estimate_photo
@@ -128,7 +131,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
                 if given is None and not run.config.is_guided and run.device == "cpu":
                     write_preview(lit.run, lit.light)
                 detailed = pool.submit(with_photo_detail, lit)
-                look = pool.submit(look_of, lit.run, lit.light)
+                look = pool.submit(first or look_of, lit.run, lit.light)
                 with run.timings.stage("scene"):
                     placed = place_result(lit.run, lit.light)
                     lit, seen = detailed.result(), look.result()
@@ -139,9 +142,7 @@ def _insert_one(config: InsertConfig, loaders: "Loaders | None" = None) -> Inser
     return Insertion(output.path, (*record["files"], "run.json"), record)
 
 
-def _read(
-    config: InsertConfig, loaders: "Loaders | None" = None
-) -> "tuple[Run, SceneLight | None]":
+def _read(config: InsertConfig, loaders: "Loaders | None") -> "tuple[Run, SceneLight | None]":
     """Read and check what is given, and print what is assumed; None: the light is not given."""
     from warpir.app.inputs import read_inputs
     from warpir.app.record import Timings
@@ -163,8 +164,7 @@ def _read(
         log.assume(*inputs.assumed, *(light.assumed if light is not None else ()))
         log.notice(*inputs.notices)
     output = output_folder(config.output, config.is_guided)
-    run = Run(config, inputs, output, log, timings, Memory(say=say), StepProgress(say))
-    return run, light
+    return Run(config, inputs, output, log, timings, Memory(say=say), StepProgress(say)), light
 
 
 def _write(lit: "LitRun", rendered: "RenderedResult", asked: InsertConfig) -> dict[str, Any]:
@@ -226,7 +226,7 @@ def _validate(config: InsertConfig) -> None:
 
         check_frames(config)
     else:
-        run, _ = _read(config)
+        run, _ = _read(config, None)
         run.output.check()
         run.require_room()
     if config.render.device not in (None, "cpu"):  # only Warp knows whether there is one

@@ -38,6 +38,9 @@ class CameraLook:
     jpeg: JpegCoding | None = None
     is_grey: bool = False
     """Whether the photo is black and white, and so are object and shadow."""
+    frame: str | None = None
+    """Frame of a sequence whose photo told what is estimated of blur, grain and response; None:
+    the photo itself."""
 
     def blur_to_add(self, enlarged: float = 1.0) -> float:
         """Return the Gaussian that a rendered object lacks [px].
@@ -162,6 +165,11 @@ class CameraLook:
                 f"the photo is a JPEG of quality {self.jpeg.quality}, and so are the object and "
                 "the ground that it changes (--grain)"
             )
+        if self.frame is not None and (self.blur or self.grain or self.response):
+            found.append(
+                f"contrast, blur and grain are those of frame {self.frame}, for all frames of its "
+                "size: one camera took them (--response, --sharpness, --grain)"
+            )
         return found
 
     def record(self) -> dict[str, Any]:
@@ -172,6 +180,7 @@ class CameraLook:
             **({} if self.response is None else {"response": asdict(self.response)}),
             **({} if self.jpeg is None else {"jpeg": {"quality": self.jpeg.quality}}),
             **({"grey": True} if self.is_grey else {}),
+            **({} if self.frame is None else {"frame": self.frame}),
         }
 
 

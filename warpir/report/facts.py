@@ -359,6 +359,9 @@ def _look(look: Mapping[str, Any]) -> Rows:
         weakest, strongest = (255.0 * f(map(f, grain["strength"])) for f in (min, max))
         text = f"{weakest:.1f} to {strongest:.1f} codes of 255, {grain['size']:.1f} px wide"
         rows.append(("grain on the object, as of the photo", text))
+    if frame := look.get("frame"):
+        text = f"frame {frame} of the sequence, for all frames of its size"
+        rows.append(("photo in which these were estimated", text))
     if jpeg := look.get("jpeg"):
         rows.append(("JPEG coding of the object, as of the photo", f"quality {jpeg['quality']}"))
     return rows

@@ -10,6 +10,7 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.app.record import config_of_picture
 from warpir.app.run import Run
+from warpir.app.settings import LookConfig
 from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.progress import progress_bar
 from warpir.io.curves_file import curves_to_json
@@ -34,7 +35,7 @@ from warpir.scene.camera import Camera
 from warpir.scene.light import Light, LightSummary, as_file_map, summarize
 from warpir.scene.near.lamps import records_of
 from warpir.scene.placement import box_corners
-from warpir.scene.tone_curves import ToneKnots
+from warpir.scene.tone_curves import Curves, ToneKnots
 
 NOT_HANDED_OVER = (
     "the files for Blender, three.js and Mitsuba hold the light from afar alone, not the lamps "
@@ -135,31 +136,41 @@ def _small_inputs(inputs: Inputs) -> Inputs:
     return replace(inputs, photo=photo, camera=camera, occluder=occluder)
 
 
-def look_of(run: Run, light: SceneLight) -> CameraLook:
+def look_of(run: Run, light: SceneLight, shared: CameraLook | None = None) -> CameraLook:
     """Return what the camera did to the photo, as far as the object is to share it.
+
+    ``shared`` is `estimated_look` of another frame: its blur, response and grain hold for this one.
+    """
+    photo, asked = run.inputs.photo, run.config.look
+    look = replace(
+        shared or estimated_look(run.inputs, asked, light.curves),
+        jpeg=None if asked.grain == "off" else photo.jpeg,
+        is_grey=look_of_preview(photo, asked.response).is_grey,
+    )
+    words = {"blur": asked.sharpness, "grain": asked.grain, "response": asked.response}
+    given: dict[str, Any] = {part: None for part, word in words.items() if word != "auto"}
+    run.log.assume(*replace(look, **given).lines())
+    return look
+
+
+def estimated_look(inputs: Inputs, asked: LookConfig, curves: Curves) -> CameraLook:
+    """Estimate blur, response and grain of a photo; what is given stays as it is.
 
     A recovered tone curve was judged beside the photo, so it holds the response already; Reinhard's
     operator has a shoulder of its own, and a linear plate has no response. A plate of any unit is
     looked at as it is exposed.
     """
-    photo, asked = run.inputs.photo, run.config.look
-    inputs = run.inputs
-    to_world = inputs.placement.asset_to_world
+    photo, to_world = inputs.photo, inputs.placement.asset_to_world
     world = box_corners(*inputs.asset.bounds()) @ to_world[:3, :3].T + to_world[:3, 3]
     around = region_around(inputs.camera.project(world), photo.srgb.shape[0], photo.srgb.shape[1])
     response = asked.response
-    is_shown = light.curves.tone == "reinhard" or not light.curves.foreground.is_identity
+    is_shown = curves.tone == "reinhard" or not curves.foreground.is_identity
     if response == "auto" and (is_shown or photo.is_linear):
         response = "off"
-    words = asked.sharpness, asked.grain, response
     shown, factor = photo.exposed()
     linear = photo.linear() * np.float32(factor) if photo.is_linear else photo.linear()
-    look = estimate_look(shown, linear, around, *words, photo.jpeg)
-    look = replace(look, is_grey=look_of_preview(photo, asked.response).is_grey)
-    parts = zip(("blur", "grain", "response"), words, strict=True)
-    given: dict[str, Any] = {part: None for part, word in parts if word != "auto"}
-    run.log.assume(*replace(look, **given).lines())
-    return look
+    words = asked.sharpness, asked.grain, response
+    return estimate_look(shown, linear, around, *words, photo.jpeg)
 
 
 def _picture(

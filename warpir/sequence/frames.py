@@ -58,9 +58,10 @@ class Frame:
     line: int
     """Of the file, from 1."""
     config: InsertConfig
-    """Complete: it makes the same result without the sequence, but for a camera that is estimated,
-    a ground that is fitted and open ground that is looked for, where the first frame's hold for the
-    others; and for an object outside the photo, which a single photo refuses."""
+    """Complete: it makes the same result without the sequence, but for a camera or a look that is
+    estimated, a ground that is fitted and open ground that is looked for, where those of the first
+    frame that has them hold for the others; and for an object outside the photo, which a single
+    photo refuses."""
     changed: tuple[str, ...]
     """The fields that the line names."""
     is_done: bool = False

@@ -15,6 +15,7 @@ from warpir.core.progress import LINE_SECONDS, duration
 from warpir.core.signals import Stopped
 from warpir.io.results import OutputFolder
 from warpir.sequence.frames import SUMMARY, Frame, read_sequence, write_summary
+from warpir.sequence.look import FirstLook
 from warpir.sequence.page import PAGE, refuse_other_page, write_sequence_report
 
 
@@ -30,7 +31,9 @@ def check_frames(config: InsertConfig) -> None:
 
 
 def insert_frames(
-    config: InsertConfig, insert_one: Callable[[InsertConfig, Loaders], object], renews: bool
+    config: InsertConfig,
+    insert_one: Callable[[InsertConfig, Loaders, FirstLook], object],
+    renews: bool,
 ) -> tuple[Path, tuple[str, ...], dict[str, Any]]:
     """Insert into every frame that is not done, then write summary, page and video.
 
@@ -43,7 +46,8 @@ def insert_frames(
         InputError: A line or a frame cannot be used, or the disk is full.
     """
     loaders = Loaders(FirstPhoto(), must_be_seen=False)
-    frames = _read_frames(config, loaders, renews)
+    first = FirstLook(loaders)
+    frames = _read_frames(config, loaders, renews, first.look_at)
     done, rendered, began = 0, 0, time.monotonic()
     todo = sum(not frame.is_done for frame in frames)
     try:
@@ -58,7 +62,7 @@ def insert_frames(
                 say(line)
                 if frame.config.output.overwrite and not config.output.overwrite:
                     say("notice: its settings or inputs have changed: it is rendered again")
-                insert_one(frame.config, loaders)
+                insert_one(frame.config, loaders, first)
                 rendered += 1
             done += 1
     except Stopped as error:
@@ -85,7 +89,12 @@ def _say_left_over(out: Path, frames: tuple[Frame, ...]) -> None:
         )
 
 
-def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -> tuple[Frame, ...]:
+def _read_frames(
+    config: InsertConfig,
+    loaders: Loaders,
+    renews: bool = False,
+    take_note: Callable[[Frame, Inputs], None] = lambda *_: None,
+) -> tuple[Frame, ...]:
     """Read all frames, as `read_sequence`, and say where an object would not stay in its place.
 
     Raises:
@@ -101,6 +110,7 @@ def _read_frames(config: InsertConfig, loaders: Loaders, renews: bool = False) -
             say(f"checked: frames up to {frame.folder.name}")
         if frame.config.placement.place is None and "at" not in frame.changed:
             poses.add(inputs.camera.c2w.tobytes())
+        take_note(frame, inputs)
 
     frames = read_sequence(config, loaders, renews=renews, look_at=look_at)
     if len(poses) > 1:
