@@ -122,3 +122,22 @@ def test_given_values_are_no_frames(
     first, _, third, _ = looks_of(tmp_path / "b")
     assert first["blur"]["sigma"] == 1.0 and first["grain"] == third["grain"]
     assert first["frame"] == "0002" and "response" not in first
+
+
+def test_frames_of_an_earlier_look_are_told(
+    film: tuple[list[str], Path, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The frame that tells the look is another photo since; the rest is done already."""
+    argv, done, _ = film
+    out = shutil.copytree(done, tmp_path / "out")
+    lines = Path(argv[argv.index("--sequence") + 1]).read_text().splitlines()
+    lines[1] = lines[2]
+    (tmp_path / "s.jsonl").write_text("\n".join(lines))
+    argv = [*argv, "--sequence", str(tmp_path / "s.jsonl"), "--out", str(out)]
+    shutil.rmtree(out / "0002")
+    assert main(argv) == ExitCode.DONE
+    assert "notice: 0001, 0003, of an earlier run, have another" in capsys.readouterr().out
+    for name in ("0001", "0003"):
+        shutil.rmtree(out / name)
+    assert main(argv) == ExitCode.DONE
+    assert "of an earlier run" not in capsys.readouterr().out

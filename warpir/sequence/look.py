@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from warpir.app.inputs import Inputs, Loaders, read_inputs
+from warpir.core.strict_json import read_json_object
 from warpir.sequence.frames import Frame
 
 if TYPE_CHECKING:
@@ -27,12 +28,14 @@ class FirstLook:
     def __init__(self, loaders: Loaders) -> None:
         """Read frames by the loaders that have read all of them before."""
         self._loaders = loaders
+        self._frames: list[tuple[Frame, Kind]] = []
         self._first: dict[Kind, tuple[Frame, bool]] = {}
         self._found: dict[Kind, CameraLook] = {}
 
     def look_at(self, frame: Frame, inputs: Inputs) -> None:
         """Take note of a frame; all of them, in their order, come before the first look."""
         kind, is_seen = _kind(inputs.photo), inputs.placement.is_seen
+        self._frames.append((frame, kind))
         if kind not in self._first or (is_seen and not self._first[kind][1]):
             self._first[kind] = frame, is_seen
 
@@ -55,6 +58,19 @@ class FirstLook:
             is_told = "auto" in (asked.sharpness, asked.response, asked.grain)
             self._found[kind] = replace(look, frame=frame.folder.name if is_told else None)
         return look_of(run, light, self._found[kind])
+
+    def others(self) -> list[str]:
+        """Return which finished frames have another look, of a first frame that has changed."""
+        return [
+            frame.folder.name
+            for frame, kind in self._frames
+            if _written(frame) != _written(self._first[kind][0])
+        ]
+
+
+def _written(frame: Frame) -> list[Any]:
+    look = read_json_object(frame.folder / "run.json").get("measured", {}).get("look", {})
+    return [look.get(part) for part in ("blur", "grain", "response")]
 
 
 def _kind(photo: Photo) -> Kind:

@@ -74,6 +74,12 @@ def insert_frames(
         attempt(PAGE, lambda: write_sequence_report(config, frames))
     record = write_summary(config, frames, say)
     _say_left_over(config.output.folder, frames)
+    if others := first.others():
+        say(
+            f"notice: {', '.join(others[:5])}{' ...' * (len(others) > 5)}, of an earlier run, have "
+            "another blur, contrast or grain than the frame that tells them now: remove these "
+            "folders to render them again"
+        )
     composites = (f"{frame.folder.name}/composite.png" for frame in frames)
     return config.output.folder, (*composites, *record["video"], SUMMARY), record
 
