@@ -1064,3 +1064,29 @@ def test_mask_is_not_taken_for_pixel_numbers(shape: tuple[int, ...]) -> None:
         renderer.foreground(light, mask, 1, 1, 1, 0)
     with pytest.raises(TypeError, match="expected row-major indices"):
         renderer.receiver(light, mask, np.ones(shape, np.int32), 1, 1, 0)
+
+
+@pytest.mark.parametrize("wrong", [-1, 1 << 32, None])
+def test_pixels_outside_the_picture_are_refused(wrong: int | None) -> None:
+    """They were traced as if the picture went on, or as what is left of them in 32 bits."""
+    renderer = make(card(Material()), CARD_VIEW, "cpu")
+    count = CARD_VIEW.width * CARD_VIEW.height
+    light = light_args(constant(), renderer.device)
+    pixels = np.array([count - 1, count if wrong is None else wrong], np.int64)
+    seen = np.ones(2, np.int32)
+    with pytest.raises(ValueError, match=f"expected row-major indices from 0 to {count - 1} "):
+        renderer.foreground(light, pixels, 1, 1, 1, 0)
+    with pytest.raises(ValueError, match=f"from 0 to {count - 1} .found .*{pixels[1]}"):
+        renderer.receiver(light, pixels, seen, 1, 1, 0)
+    renderer.receiver(light, pixels[:1], seen[:1], 1, 1, 0)
+
+
+def test_pixels_of_another_resolution_are_as_many_as_it_has() -> None:
+    """The scene's own picture does not bound them; none is negative."""
+    renderer = make(card(Material()), CARD_VIEW, "cpu")
+    light, seen = light_args(constant(), renderer.device), np.ones(1, np.int32)
+    larger = CARD_VIEW.scaled(2 * CARD_VIEW.width, 2 * CARD_VIEW.height)
+    view, last = renderer.scene.camera_args_at(larger), larger.width * larger.height - 1
+    renderer.receiver(light, np.array([last], np.int32), seen, 1, 1, 0, view)
+    with pytest.raises(ValueError, match="expected row-major indices from 0"):
+        renderer.receiver(light, np.array([-1], np.int32), seen, 1, 1, 0, view)

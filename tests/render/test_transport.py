@@ -464,6 +464,15 @@ def test_transport_refuses_what_it_cannot_do(device: str) -> None:
     assert caught.value.code == ExitCode.RESOURCES
 
 
+def test_transport_refuses_pixels_outside_the_picture() -> None:
+    """They were traced as if the picture went on."""
+    renderer = scene_of("cpu")
+    objects, proxies = pixels_of(renderer)
+    before = np.append(proxies, np.int32(-1))
+    with pytest.raises(ValueError, match="expected row-major indices from 0"):
+        TransportIntegrator(renderer, objects, before, 1, SMALL)
+
+
 def test_transport_of_nothing(device: str) -> None:
     """No triangles, no pixels: no rows, and the plane keeps its light."""
     view = camera(8, 6, 10.0, (0.0, 1.0, 0.0), pitch=-30.0)

@@ -354,16 +354,6 @@ class Launcher:
         """Copy values to the device."""
         return wp.array(values, dtype=dtype, device=self.device)
 
-    def upload_pixels(self, pixels: NDArray[np.generic]) -> wp.array:
-        """Copy row-major pixel indices to the device.
-
-        Raises:
-            TypeError: It is a mask, whose values would be pixels 0 and 1.
-        """
-        if pixels.dtype == np.bool_:
-            raise TypeError("pixels: expected row-major indices, as np.flatnonzero(mask) gives")
-        return self.upload(pixels, wp.int32)
-
     def zeros(self, count: int, dtype: type) -> wp.array:
         """Return a zeroed output of ``count`` rows; one row where there are none."""
         return wp.zeros(max(count, 1), dtype=dtype, device=self.device)

@@ -46,6 +46,28 @@ def variant_of(scene: Scene, materials: MaterialArgs, viewer: Viewer) -> tuple[i
     )
 
 
+def uploaded(renderer: Renderer, pixels: IntArray, view: CameraArgs) -> wp.array:
+    """Copy row-major pixel indices to the device.
+
+    Args:
+        renderer: The scene.
+        pixels: Shape [pixel].
+        view: Of the camera whose picture they are of; only the scene's own says how high it is.
+
+    Raises:
+        TypeError: It is a mask, whose values would be pixels 0 and 1.
+        ValueError: A pixel lies outside the picture; one that the kernels would trace all the same.
+    """
+    if pixels.dtype == np.bool_:
+        raise TypeError("pixels: expected row-major indices, as np.flatnonzero(mask) gives")
+    scene, camera = renderer.scene, renderer.scene.camera
+    count = camera.width * camera.height if view is scene.camera_args else 1 << 31
+    if pixels.size and not 0 <= pixels.min() <= pixels.max() < count:
+        found = f"found {pixels.min()} to {pixels.max()}"
+        raise ValueError(f"pixels: expected row-major indices from 0 to {count - 1} ({found})")
+    return renderer.upload(pixels, wp.int32)
+
+
 def geometry_of(
     renderer: Renderer, pixels: IntArray, spp: int, seed: int
 ) -> tuple[FloatArray, ...]:
@@ -60,7 +82,7 @@ def geometry_of(
         trace_gbuffer,
         count,
         [
-            Rows(renderer.upload_pixels(pixels)),
+            Rows(uploaded(renderer, pixels, scene.camera_args)),
             scene.camera_args,
             *scene.geometry(),
             spp,
@@ -157,7 +179,7 @@ class ObjectLaunch:
             kernel,
             len(pixels),
             [
-                Rows(renderer.upload_pixels(pixels)),
+                Rows(uploaded(renderer, pixels, self.camera_args)),
                 hidden,
                 self.camera_args,
                 *scene.geometry(self.materials),
@@ -234,7 +256,7 @@ class ReceiverLaunch:
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
         seen = [
-            Rows(renderer.upload_pixels(pixels)),
+            Rows(uploaded(renderer, pixels, self.camera_args)),
             Rows(renderer.upload(may_see_object, wp.int32)),
             self.camera_args,
             *renderer.scene.shadow_geometry(),
@@ -279,7 +301,7 @@ class ReceiverLaunch:
             trace_lamps,
             len(pixels),
             [
-                Rows(renderer.upload_pixels(pixels)),
+                Rows(uploaded(renderer, pixels, self.camera_args)),
                 Rows(renderer.upload(may_see_object, wp.int32)),
                 self.camera_args,
                 *renderer.scene.shadow_geometry(),

@@ -90,7 +90,7 @@ class ReceiverRadiance:
 
 
 class Renderer(Launcher):
-    """Launches the kernels over one scene.
+    """Launches the kernels over one scene; pixels outside its picture are a ValueError.
 
     Args:
         scene: Scene to render, never changed.

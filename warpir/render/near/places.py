@@ -8,6 +8,7 @@ import warp as wp
 from warpir.core.arrays import FloatArray, IntArray
 from warpir.kernels.lamps.places import trace_ground_places, trace_places
 from warpir.render.device import Rows
+from warpir.render.launches import uploaded
 from warpir.render.renderer import Renderer
 
 
@@ -50,7 +51,7 @@ def place_slopes(
         kernel: wp.Kernel, outputs: int, pixels: IntArray, *args: object
     ) -> list[FloatArray]:
         out = [renderer.zeros(len(pixels), wp.mat33) for _ in range(outputs)]
-        given = [Rows(renderer.upload_pixels(pixels)), *args, seed, *map(Rows, out)]
+        given = [Rows(uploaded(renderer, pixels, scene.camera_args)), *args, seed, *map(Rows, out)]
         renderer.launch(kernel, len(pixels), given, spp * depth, "lamps")
         planes = tuple(a.numpy()[: len(pixels)] for a in out)
         width = scene.camera.width

@@ -30,6 +30,7 @@ from warpir.kernels.transport.texels import TexelArgs
 from warpir.kernels.types import Layers, LightArgs, LightRecord
 from warpir.render.device import Rows
 from warpir.render.device_light import FINE_FROM, drawn, light_args
+from warpir.render.launches import uploaded
 from warpir.render.renderer import Renderer
 from warpir.render.transport.tents import direction_counts, texel_args
 from warpir.scene.light import Light
@@ -112,7 +113,7 @@ class _ObjectTrace:
         points, emission = _surface_points(renderer, pixels, subsamples, seed)
         texel_count = texels.height * texels.width
         T = wp.zeros((len(pixels), texel_count), dtype=wp.vec3, device=renderer.device)
-        launched = Rows(renderer.upload_pixels(pixels))
+        launched = Rows(uploaded(renderer, pixels, renderer.scene.camera_args))
         renderer.launch(
             trace_direct,
             len(pixels),
@@ -232,7 +233,7 @@ def _surface_points(
         trace_points,
         count,
         [
-            Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+            Rows(uploaded(renderer, pixels, scene.camera_args)),
             scene.camera_args,
             *scene.geometry(),
             subsamples,
@@ -268,7 +269,7 @@ def _receiver_points(
 ) -> _ReceiverPoints:
     scene, device, count = renderer.scene, renderer.device, len(pixels)
     points = _ReceiverPoints(
-        Rows(wp.array(pixels, dtype=wp.int32, device=device)),
+        Rows(uploaded(renderer, pixels, scene.camera_args)),
         Rows(wp.zeros(count, dtype=int, device=device)),
         Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
         Rows(wp.empty((count, subsamples), dtype=wp.vec3, device=device)),
