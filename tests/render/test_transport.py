@@ -473,6 +473,12 @@ def test_transport_refuses_pixels_outside_the_picture() -> None:
         TransportIntegrator(renderer, objects, before, 1, SMALL)
 
 
+def test_type_of_stored_rows_is_checked_at_once() -> None:
+    """It was a KeyError once all else was prepared."""
+    with pytest.raises(ValueError, match=r"dtype: expected bfloat16 or float32 \(found 'float16'"):
+        TransportSettings(dtype="float16")
+
+
 def test_transport_of_nothing(device: str) -> None:
     """No triangles, no pixels: no rows, and the plane keeps its light."""
     view = camera(8, 6, 10.0, (0.0, 1.0, 0.0), pitch=-30.0)

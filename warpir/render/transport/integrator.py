@@ -46,8 +46,6 @@ from warpir.render.transport.tents import direction_counts, flux_noise, tent_irr
 from warpir.render.transport.thrown import thrown_rows
 from warpir.scene.light import Light, rasterize_lobes
 
-DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
-
 
 class TransportIntegrator:
     """Light transport as stored rows; gradients to the light and the lamps' powers alone.
@@ -214,7 +212,7 @@ class TransportIntegrator:
 
     def _new_rows(self, shape: tuple[int, int, int], lower: str) -> Tensor:
         """Return space for the rows of a matrix a channel, shape [channel, row, column]."""
-        dtype = DTYPES[self.settings.dtype]
+        dtype = getattr(torch, self.settings.dtype)
         return self.renderer.memory.again(
             lambda: torch.empty(shape, dtype=dtype, device=self.device), TRACING, lower
         )

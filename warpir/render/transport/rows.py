@@ -44,6 +44,8 @@ LOWER_OBJECT = "--object-light-height or --guidance-width"
 LOWER_SHADOW = "--light-height or --guidance-width"
 """Flags that lower the memory of tracing."""
 
+DTYPES = ("bfloat16", "float32")
+"""Torch's types in which the object's rows may be stored."""
 PILOT_SUBSAMPLES = 8
 PILOT_SEED = 0x2F6E2B1
 """Seed of the samples that classify mirrors."""
@@ -67,7 +69,11 @@ class ObjectRows:
 
 @dataclass(frozen=True)
 class TransportSettings:
-    """Resolution and storage of traced light transport."""
+    """Resolution and storage of traced light transport.
+
+    Raises:
+        ValueError: ``dtype`` is not one of `DTYPES`.
+    """
 
     height_fg: int = 32
     """Rows of the map that lights the object; the map is twice as wide."""
@@ -84,9 +90,13 @@ class TransportSettings:
     """Directions per pixel and map that are allocated by the expected light, on top of one per
     texel."""
     dtype: str = "bfloat16"
-    """Type in which the object's rows are stored, ``bfloat16`` or ``float32``."""
+    """Type in which the object's rows are stored, of `DTYPES`."""
     memory_mib: int = 1024
     """Memory limit of the stored rows [MiB]."""
+
+    def __post_init__(self) -> None:
+        if self.dtype not in DTYPES:
+            raise ValueError(f"dtype: expected {' or '.join(DTYPES)} (found {self.dtype!r})")
 
 
 @dataclass(frozen=True)
