@@ -5,6 +5,7 @@ https://docs.comfy.org/custom-nodes/backend/server_overview says what a node has
 
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,15 @@ def _output(name: str) -> Path:
         root = Path(tempfile.gettempdir())
     root.mkdir(parents=True, exist_ok=True)
     return Path(tempfile.mkdtemp(prefix=f"warpir-{name}-", dir=root))
+
+
+def _stop_if_cancelled() -> Callable[[], object]:
+    """Return what raises once ComfyUI's user has cancelled; outside of ComfyUI nothing does."""
+    try:
+        from comfy.model_management import throw_exception_if_processing_interrupted as stop
+    except ImportError:
+        return lambda: None
+    return stop
 
 
 def _is_of_a_node(light: str) -> bool:
@@ -192,6 +202,7 @@ class InsertObject:
 
         from warpir import insert
         from warpir.app.config import InsertConfig
+        from warpir.core.progress import asking
 
         if (at_x < 0.0) != (at_y < 0.0):
             raise ValueError("at_x and at_y: give both, or leave both at -1")
@@ -211,7 +222,7 @@ class InsertObject:
             Image.fromarray(np.uint8(np.round(share * 255.0))).save(folder / "occluder.png")
             values["occluder_mask"] = str(folder / "occluder.png")
         # ComfyUI runs nodes without derivatives, and a model guides by nothing else.
-        with torch.inference_mode(False):
+        with torch.inference_mode(False), asking(_stop_if_cancelled()):
             found = insert(InsertConfig(**values))
         layers = found.layers()
         with Image.open(found.out / "composite.png") as picture:

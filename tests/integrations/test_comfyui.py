@@ -128,6 +128,38 @@ def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
     assert (Path(folder) / "report.html").is_file() and Path(light).is_file()
 
 
+def test_cancelling_stops_an_insertion(
+    nodes: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ComfyUI's flag is asked while the picture is made, and its own exception comes through."""
+
+    class InterruptProcessingException(Exception):
+        pass
+
+    asked = 0
+
+    def throw_exception_if_processing_interrupted() -> None:
+        nonlocal asked
+        asked += 1
+        if asked == 5:  # as ComfyUI's, which takes the flag back
+            raise InterruptProcessingException
+
+    stub = ModuleType("comfy.model_management")
+    vars(stub)["throw_exception_if_processing_interrupted"] = (
+        throw_exception_if_processing_interrupted
+    )
+    monkeypatch.setitem(sys.modules, "comfy", ModuleType("comfy"))
+    monkeypatch.setitem(sys.modules, "comfy.model_management", stub)
+    write_inputs(tmp_path)
+    inputs = {"image": image_of(tmp_path / "photo.png"), "asset": str(tmp_path / "box.obj")}
+    inputs |= {"light": str(tmp_path / "sky.hdr"), "size": 0.4, "samples": 4}
+    with pytest.raises(InterruptProcessingException):
+        called(nodes, "WarpirInsertObject", **inputs)
+    assert not [*tmp_path.rglob("composite.png")]
+    *_, folder = called(nodes, "WarpirInsertObject", **inputs)
+    assert (Path(folder) / "composite.png").is_file() and asked > 10
+
+
 def test_linked_light_keeps_its_level(nodes: ModuleType, tmp_path: Path) -> None:
     """The estimated map has the photo's level, which another map is scaled to."""
     write_inputs(tmp_path)

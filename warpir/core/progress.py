@@ -6,11 +6,28 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Self
 
 LINE_SECONDS = 10.0
 """Least time between two lines where there is no terminal [s]."""
+
+_asked: ContextVar[Callable[[], object]] = ContextVar("_asked", default=lambda: None)
+
+
+@contextmanager
+def asking(ask: Callable[[], object]) -> Iterator[None]:
+    """Call ``ask`` with each report of progress that this thread makes within the block.
+
+    What it raises ends the run: so a program that warpir runs in, and that has a button for it,
+    stops an insertion.
+    """
+    before = _asked.set(ask)
+    try:
+        yield
+    finally:
+        _asked.reset(before)
 
 
 @dataclass
@@ -49,6 +66,7 @@ def progress_bar(say: Callable[[str], None]) -> Iterator[Callable[[str, float], 
 
         def report_line(stage: str, share: float) -> None:
             nonlocal last_line
+            _asked.get()()
             if stage and time.monotonic() - last_line >= LINE_SECONDS:
                 last_line = time.monotonic()
                 say(f"{stage}: {100.0 * share:.0f} of 100 %")
@@ -62,6 +80,7 @@ def progress_bar(say: Callable[[str], None]) -> Iterator[Callable[[str, float], 
         tasks: dict[str, Any] = {}
 
         def report(stage: str, share: float) -> None:
+            _asked.get()()
             if stage:
                 if stage not in tasks:
                     tasks[stage] = progress.add_task(stage, total=1.0)
@@ -104,6 +123,7 @@ class StepProgress:
 
     def report(self, stage: str, done: int, total: int, words: str = "") -> None:
         """Show how far a stage is."""
+        _asked.get()()
         if self._bars is not None:
             if stage not in self._tasks:
                 self._tasks[stage] = self._bars.add_task(stage, total=total, words=words)
