@@ -13,6 +13,7 @@ from warpir.look.response import (
     Response,
     estimate_response,
     response_through,
+    statistics,
 )
 
 
@@ -87,6 +88,12 @@ def test_no_dark_regions_tell_nothing(low: float, high: float) -> None:
     assert estimate_response(ramp(low, high)) is None
     look = estimate_look(ramp(low, high) ** (1 / 2.2), ramp(low, high), None, "off", "off", "auto")
     assert look.response is None and look.record().keys() == {"blur", "grain"}
+
+
+def test_strip_of_a_photo_has_statistics() -> None:
+    """Lower than the squares that a photo as wide is averaged in."""
+    strip = np.tile(ramp(0.0, 0.9)[:1], (4, 1000, 1))[:, :1000]
+    assert np.isfinite(statistics(strip)).all() and estimate_response(strip) is not None
 
 
 def test_values_above_white_stay() -> None:

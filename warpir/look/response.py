@@ -110,7 +110,7 @@ def statistics(linear: AnyFloatArray) -> Float64Array:
         Share of near clipped pixels, logarithm of the darkest thousandth's display value, mean
         display value, mean saturation [1].
     """
-    step = max(1, round(linear.shape[1] / WIDTH))
+    step = max(1, min(round(linear.shape[1] / WIDTH), len(linear)))
     rows, columns = linear.shape[0] // step * step, linear.shape[1] // step * step
     tiles = linear[:rows, :columns].reshape(rows // step, step, columns // step, step, 3)
     shown = np.clip(tiles.mean(axis=(1, 3), dtype=np.float64), 0.0, 1.0) ** (1.0 / GAMMA)
