@@ -158,6 +158,17 @@ def test_photo_that_shows_nothing_has_no_coat(pitch: float) -> None:
     assert np.isfinite([found.explained, found.over_displaced, found.strength]).all()
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "fov_deg", "reason"),
+    [(240, 360, 24.0, "no mirror image found"), (90, 360, 14.0, "too narrow to tell")],
+)
+def test_narrow_photo_has_no_coat(width: int, height: int, fov_deg: float, reason: str) -> None:
+    """An upright telephoto, in which nothing lies far enough aside to compare with."""
+    camera = camera_from_fov(width, height, fov_deg, -5.0, EYE)
+    found = estimate_coat(np.full((height, width, 3), 0.4), camera, UP)
+    assert found.roughness is None and reason in found.reason
+
+
 def test_square_of_the_demo_is_wet_after_rain_alone() -> None:
     """The demo's photos, whose coat is known."""
     told = json.loads(CAMERA.read_text())

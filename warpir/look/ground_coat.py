@@ -136,13 +136,15 @@ def estimate_coat(linear: AnyFloatArray, camera: Camera, up: Float64Array) -> Gr
     view = _unrolled(linear, camera, up)
     if len(view.rows) < 10 or view.elevation[0] < 3.0:
         return GroundCoat(None, None, "the photo does not show ground and what it would mirror")
+    columns = np.arange(view.values.shape[1])
+    apart = np.minimum(columns, len(columns) - columns) * STEP >= DISPLACED
+    if not apart.any():
+        return GroundCoat(None, None, "the photo is too narrow to tell mirror images from chance")
     ground = _ground(view)
     fit, power = _agreement(view, ground)
     gain = _gain(fit, power, FAINT)
     of_sector = gain.max(axis=1)  # at the best distance; [roughness, flip, sector, shift]
     total = of_sector.sum(axis=2) / max(float((ground.weight * ground.detail**2).sum()), 1e-12)
-    columns = np.arange(total.shape[-1])
-    apart = np.minimum(columns, len(columns) - columns) * STEP >= DISPLACED
     best = int(total[:, 0, 0].argmax())
     chance = float(np.delete(total.max(axis=0), columns[~apart], axis=1).max())
     explained = float(total[best, 0, 0])
