@@ -131,6 +131,14 @@ def test_drawn_grain_has_unit_variance() -> None:
         assert (noise != grain.draw((200, 200), 6)).any()
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (1, 60), (6, 6)])
+def test_few_pixels_have_no_more_grain_than_many(shape: tuple[int, int]) -> None:
+    """An object far away: the filter met itself round the edge, up to seven times the grain."""
+    grain = Grain((0.5,), ((0.01,) * 3,), 2.0, 0.4)
+    power = np.mean([(grain.draw(shape, seed) ** 2).mean() for seed in range(600)])
+    assert power**0.5 == pytest.approx(1.0, abs=0.08)
+
+
 def test_object_gets_grain_and_ground_what_it_lacks() -> None:
     """Full strength on the object, next to nothing on ground that kept the photo's, 0 elsewhere."""
     grain = Grain((0.5,), ((0.02,) * 3,), 0.0, 0.0)

@@ -7,6 +7,7 @@ blocks of the photo's JPEG coding are repeated too.
 from __future__ import annotations
 
 import itertools
+import math
 import zlib
 from dataclasses import dataclass, replace
 
@@ -94,7 +95,9 @@ class Grain:
     def draw(self, shape: tuple[int, int], *seed: int) -> Float64Array:
         """Return noise of unit variance with the grain's size and correlation, shape [H, W, 3]."""
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed)))
-        shared, own = rng.standard_normal((*shape, 1)), rng.standard_normal((*shape, 3))
+        # In less than the filter's reach of four deviations noise would meet itself round the edge.
+        height, width = (max(side, 2 * math.ceil(4.0 * self.size) + 1) for side in shape)
+        shared, own = (rng.standard_normal((height, width, count)) for count in (1, 3))
         common = min(max(self.correlation, 0.0), 1.0)
         # In place: these are the largest arrays of a run with a large photo.
         noise: Float64Array = own
@@ -106,7 +109,7 @@ class Grain:
             impulse[16, 16] = 1.0
             kernel = ndimage.gaussian_filter(impulse, self.size)
             noise /= np.sqrt((kernel**2).sum())
-        return noise
+        return noise[: shape[0], : shape[1]]
 
 
 def estimate_grain(srgb: AnyFloatArray) -> Grain | None:
