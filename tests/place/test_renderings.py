@@ -1,6 +1,7 @@
 """Pictures that warpir renders for the placing page."""
 
 import json
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tests.builders.programs.browser import needs_chromium
 from tests.builders.programs.placing import STATE, command, placing, press, save, settle
 from warpir.core.errors import InputError
 from warpir.place.renderings import Renderings, policy_of
+from warpir.place.server import PlaceServer
 from warpir.place.worker import PATIENCE, Worker
 
 
@@ -64,6 +66,27 @@ def test_files_of_results_only(tmp_path: Path) -> None:
         assert renderings.file("result/run.json") is not None  # the report links it
         for name in ("result/other.txt", "result/../secret", "result/", "a.png", "preview-1.png"):
             assert renderings.file(name) is None
+    finally:
+        renderings.close()
+
+
+@pytest.mark.parametrize("kind", ["preview", "insert"])
+def test_a_session_that_ends_waits_for_an_insertion_alone(kind: str) -> None:
+    """Whose results stay; and for nothing where nothing was begun."""
+    renderings, goes_on, is_done = Renderings(Silent()), threading.Event(), threading.Event()
+    server = object.__new__(PlaceServer)
+    server.shutdown = is_done.set  # type: ignore[method-assign]
+    try:
+        server.end(renderings.wait)
+        assert is_done.is_set()
+        is_done.clear()
+        renderings._begin(kind, lambda: str(goes_on.wait(30.0)))
+        ending = threading.Thread(target=server.end, args=(renderings.wait,))
+        ending.start()
+        assert is_done.wait(0.3) == (kind == "preview")
+        goes_on.set()
+        ending.join(30.0)
+        assert is_done.is_set()
     finally:
         renderings.close()
 

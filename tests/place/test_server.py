@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.builders.programs.children import output_of
-from tests.builders.programs.placing import Served, command, serve
+from tests.builders.programs.placing import Served, begun, command, serve
 from warpir.app.config import InsertConfig
 
 
@@ -164,6 +164,22 @@ def test_placements_are_saved_one_at_a_time() -> None:
     server.answers = {n: lambda _: {"alone": server.working.locked()} for n in names}
     alone = {name: server.answer(name, b"")["alone"] for name in names}
     assert alone == {"save": True, "insert": True, "preview": False}
+
+
+@pytest.mark.slow
+def test_once_ends_when_the_full_render_is_done(inputs: Path, tmp_path: Path) -> None:
+    """A save beside it ended the program, and the render with it."""
+    out = tmp_path / "out"
+    named = {"photo": str(inputs / "photo.png"), "asset": str(inputs / "wedge.glb")}
+    _, _, said = begun(InsertConfig(**named, out=str(out)))
+    with serve(command(inputs, out, "--once", "--sun=-60,45,3", "--sky", "clear")) as served:
+        port, token = served.parts
+        host, body = f"127.0.0.1:{port}", json.dumps(said)
+        names = "insert", "save"
+        answers = ask(served, *(("POST", f"/{token}/{name}", host, body) for name in names))
+        assert [status for status, _ in answers] == [200, 200]
+        assert served.process.wait(timeout=300) == 0
+    assert (out / "result" / "report.html").is_file()
 
 
 def test_demo_starts_where_the_user_says() -> None:

@@ -83,7 +83,8 @@ def _run(arguments: list[str]) -> int:
     with ExitStack() as until_end:
         answers = Answers(session, folder, config, unseen)
         until_end.callback(answers.close)
-        server = PlaceServer(port, answers.contents, answers.posts, answers.file, once=once)
+        wait = answers.renderings.wait if once else None
+        server = PlaceServer(port, answers.contents, answers.posts, answers.file, once=wait)
         until_end.enter_context(server)
         say(f"page: {server.address}")
         answers.renderings.load()

@@ -43,6 +43,7 @@ class Renderings:
         self._progress: dict[str, Any] = {"state": "idle"}
         self._count = 0
         self._placement: Mapping[str, Any] | None = None
+        self._insertion: threading.Thread | None = None
 
     # ------------------------------------------------------------------------ what the page asks
 
@@ -116,6 +117,11 @@ class Renderings:
                 return _content(self._results / rest)
         return None
 
+    def wait(self) -> None:
+        """Return when the insertion that has begun, if any has, is done; a preview is not kept."""
+        if self._insertion is not None:
+            self._insertion.join()
+
     def close(self) -> None:
         """End what is rendered, and remove the previews."""
         self.cancel()
@@ -136,7 +142,10 @@ class Renderings:
                 "share": None,
                 "began": time.monotonic(),
             }
-        threading.Thread(target=self._run, args=(work,), daemon=True).start()
+        thread = threading.Thread(target=self._run, args=(work,), daemon=True)
+        thread.start()
+        if kind == "insert":
+            self._insertion = thread
         return self.progress()
 
     def _run(self, work: Callable[[], str]) -> None:

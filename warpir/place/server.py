@@ -72,7 +72,8 @@ class PlaceServer(ThreadingHTTPServer):
             `InputError`.
         changing: Returns a file that may be another one the next time, by its address; None where
             there is none.
-        once: Whether the first placement that was saved ends `serve_forever`.
+        once: What is waited for once a placement was saved, before that ends `serve_forever`; None:
+            it does not.
 
     Raises:
         InputError: The port cannot be used (`ExitCode.USAGE`).
@@ -86,7 +87,7 @@ class PlaceServer(ThreadingHTTPServer):
         contents: Mapping[str, Callable[[], bytes]],
         answers: Mapping[str, Callable[[bytes], dict[str, Any]]],
         changing: Callable[[str], bytes | None] = lambda _: None,
-        once: bool = False,
+        once: Callable[[], object] | None = None,
     ) -> None:
         try:
             super().__init__((HOST, port), _Handler)
@@ -129,6 +130,11 @@ class PlaceServer(ThreadingHTTPServer):
         """
         with self.working if name in ("save", "insert") else nullcontext():
             return self.answers[name](body)
+
+    def end(self, when: Callable[[], object]) -> None:
+        """End `serve_forever` when what is waited for is there; until then all is answered."""
+        when()
+        self.shutdown()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Tell of a fault, unless it is a browser that went away in the middle of a request."""
@@ -183,9 +189,10 @@ class _Handler(BaseHTTPRequestHandler):
                 status = 422
                 answer = {"where": error.where, "what": error.what, "advice": error.advice}
             self._answer(status, KINDS["json"], json.dumps(answer).encode())
-            if self.server.once and name == "save" and status == 200:
-                # From a thread of its own: it waits for the loop, which may wait for this one.
-                threading.Thread(target=self.server.shutdown).start()
+            if self.server.once is not None and name == "save" and status == 200:
+                # In a thread of its own: it waits for the loop, which may wait for this one.
+                wait = self.server.once
+                threading.Thread(target=self.server.end, args=(wait,), daemon=True).start()
 
     def _name(self) -> str | None:
         """Return the address behind the token; None when the request was refused."""
