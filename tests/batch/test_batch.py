@@ -465,6 +465,7 @@ def test_a_name_longer_than_a_file_can_have_is_its_scenes_alone(tmp_path: Path) 
         (["empty.jsonl", "--out", "o"], ExitCode.USAGE, "scenes miscounted (found 0"),
         (["table.csv", "--out", "o"], ExitCode.USAGE, "table.csv: not JSON lines (expected"),
         (["list.json", "--out", "o"], ExitCode.USAGE, "list.json: not JSON lines (expected"),
+        (["spread.json", "--out", "o"], ExitCode.USAGE, "expected an object {...} on each line"),
         (["m.jsonl", "--out", "o", "--max-json-bytes", "9"], ExitCode.USAGE, "too large"),
         (["m.jsonl", "--out", "o", "--workers", "1" * 5000], ExitCode.USAGE, "--workers: a whole"),
         (["o/batch.json", "--out", "o"], ExitCode.USAGE, "would replace the manifest"),
@@ -483,6 +484,7 @@ def test_a_batch_that_cannot_begin(
     (tmp_path / "m.jsonl").write_text('{"name": "a", "demo": true}\n')
     (tmp_path / "empty.jsonl").write_text("\n")
     (tmp_path / "table.csv").write_text("name,demo\na,true\n")
+    (tmp_path / "spread.json").write_text('{\n  "name": "a",\n  "demo": true\n}\n')
     (tmp_path / "list.json").write_text('[\n{"name": "a", "demo": true}\n]\n')
     for name, text in (("o", '{"name": "a", "demo": true}'), ("foreign", "mine")):
         (tmp_path / name).mkdir()

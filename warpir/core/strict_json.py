@@ -139,8 +139,8 @@ def read_json_lines(
         The number and the bytes of each line that is not blank, and the sha256 of the whole file.
 
     Raises:
-        InputError: Missing, too large, of another format, such as CSV or a JSON list, or of another
-            number of lines (`ExitCode.USAGE`).
+        InputError: Missing, too large, of another format, such as CSV, a JSON list or an object
+            over several lines, or of another number of lines (`ExitCode.USAGE`).
     """
     try:
         raw = _read(Path(path), limits)
@@ -148,7 +148,9 @@ def read_json_lines(
         if not 1 <= len(lines) <= most:
             expected = f"1 to {most}"
             raise JSON.error(path, "line_count", what=what, found=len(lines), expected=expected)
-        if b"{" not in raw or raw.lstrip().startswith(b"["):
+        ends = {line.strip()[:1] + line.strip()[-1:] for _, line in lines}
+        is_over_lines = len(lines) > 1 and b"{}" not in ends
+        if b"{" not in raw or raw.lstrip().startswith(b"[") or is_over_lines:
             raise JSON.error(path, "lines", expected="an object {...} on each line")
     except InputError as error:
         error.code = ExitCode.USAGE
