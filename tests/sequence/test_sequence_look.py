@@ -141,3 +141,21 @@ def test_frames_of_an_earlier_look_are_told(
         shutil.rmtree(out / name)
     assert main(argv) == ExitCode.DONE
     assert "of an earlier run" not in capsys.readouterr().out
+
+
+def test_frames_rendered_now_are_not_of_an_earlier_run(
+    film: tuple[list[str], Path, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where the frame that tells the look now is done already, and has the earlier one itself."""
+    argv, done, _ = film
+    out = shutil.copytree(done, tmp_path / "out")
+    lines = Path(argv[argv.index("--sequence") + 1]).read_text().splitlines()
+    lines[1] = json.dumps({**json.loads(lines[1]), "place": [0, 0, 50]})
+    (tmp_path / "s.jsonl").write_text("\n".join(lines))
+    argv = [*argv, "--sequence", str(tmp_path / "s.jsonl"), "--out", str(out)]
+    shutil.rmtree(out / "0002")
+    assert main(argv) == ExitCode.DONE
+    assert record_of(out / "0002")["measured"]["look"]["frame"] == "0003"
+    assert "notice: 0001, 0003, of an earlier run, have another" in capsys.readouterr().out
+    assert main(argv) == ExitCode.DONE  # nothing is left to render
+    assert "of an earlier run" not in capsys.readouterr().out

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from warpir.app.inputs import Inputs, Loaders, read_inputs
-from warpir.core.strict_json import read_json_object
+from warpir.core.strict_json import json_bytes, read_json_object
 from warpir.sequence.frames import Frame
 
 if TYPE_CHECKING:
@@ -60,16 +61,27 @@ class FirstLook:
         return look_of(run, light, self._found[kind])
 
     def others(self) -> list[str]:
-        """Return which finished frames have another look, of a first frame that has changed."""
+        """Return which finished frames have another look than those rendered by this one.
+
+        Of a size of which none was rendered there is nothing to compare with: the frame that tells
+        the look may itself have an earlier one.
+        """
+        told = {
+            kind: _parts(json.loads(json_bytes(look.record())))
+            for kind, look in self._found.items()
+        }
         return [
             frame.folder.name
             for frame, kind in self._frames
-            if _written(frame) != _written(self._first[kind][0])
+            if kind in told and _written(frame) != told[kind]
         ]
 
 
 def _written(frame: Frame) -> list[Any]:
-    look = read_json_object(frame.folder / "run.json").get("measured", {}).get("look", {})
+    return _parts(read_json_object(frame.folder / "run.json").get("measured", {}).get("look", {}))
+
+
+def _parts(look: dict[str, Any]) -> list[Any]:
     return [look.get(part) for part in ("blur", "grain", "response")]
 
 
