@@ -91,6 +91,30 @@ def test_a_session_that_ends_waits_for_an_insertion_alone(kind: str) -> None:
         renderings.close()
 
 
+def test_what_became_of_the_insertion_waited_for_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A page that asks now and then finds no server any more."""
+    renderings = Renderings(Silent())
+
+    def full() -> str:
+        raise InputError("warpir.insert", "the disk is full")
+
+    try:
+        renderings.wait()
+        assert capsys.readouterr().out == ""
+        renderings._begin("insert", full)
+        renderings.wait()
+        said = "notice: the full render failed (warpir.insert: the disk is full)\n"
+        assert capsys.readouterr().out == said
+        renderings._results = tmp_path
+        renderings._begin("insert", lambda: "result/report.html")
+        renderings.wait()
+        assert capsys.readouterr().out == f"inserted: {tmp_path}\n"
+    finally:
+        renderings.close()
+
+
 def test_policy_of_a_page_is_its_own() -> None:
     """A report's policy names its own script; other files have none."""
     page = b'<meta http-equiv="Content-Security-Policy" content="default-src &#39;none&#39;">'

@@ -179,6 +179,8 @@ def test_once_ends_when_the_full_render_is_done(inputs: Path, tmp_path: Path) ->
         answers = ask(served, *(("POST", f"/{token}/{name}", host, body) for name in names))
         assert [status for status, _ in answers] == [200, 200]
         assert served.process.wait(timeout=300) == 0
+        assert served.process.stdout is not None
+        assert f"inserted: {out / 'result'}\n" in served.process.stdout.read()
     assert (out / "result" / "report.html").is_file()
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from warpir.app.program import say
 from warpir.core.atomic import write_file
 from warpir.core.errors import InputError
 from warpir.core.strict_json import read_json_object
@@ -118,9 +119,18 @@ class Renderings:
         return None
 
     def wait(self) -> None:
-        """Return when the insertion that has begun, if any has, is done; a preview is not kept."""
-        if self._insertion is not None:
-            self._insertion.join()
+        """Return when the insertion that has begun, if any has, is done; a preview is not kept.
+
+        What became of it is printed: the page may be gone before it asks again.
+        """
+        if self._insertion is None:
+            return
+        self._insertion.join()
+        end = self.progress()
+        if (end["kind"], end["state"]) == ("insert", "done"):
+            say(f"inserted: {self._results}")
+        elif (end["kind"], end["state"]) == ("insert", "failed"):
+            say(f"notice: the full render failed ({end['problem']})")
 
     def close(self) -> None:
         """End what is rendered, and remove the previews."""
