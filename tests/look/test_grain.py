@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from skimage import data
 
 from warpir.core.arrays import Float64Array
 from warpir.core.color import gamma_to_linear, linear_to_gamma, luminance
@@ -103,12 +104,21 @@ def test_heavy_grain_is_that_of_flat_patches(codes: float) -> None:
 def test_texture_of_some_levels_is_no_heavy_grain() -> None:
     """Rock and leaves look as grainy, but dark water among them does not; grain is everywhere."""
     rock = Grain((0.1, 0.4, 0.6), ((0.009,) * 3, (0.05,) * 3, (0.055,) * 3), 0.6, 0.95)
-    told = as_told(rock, 3.5 / 255.0)
-    assert told is not None and 255.0 * told.of_luminance == pytest.approx(3.5)
+    told = as_told(rock, 4.0 / 255.0)
+    assert told is not None and 255.0 * told.of_luminance == pytest.approx(4.0)
     grainy = replace(rock, strength=((0.04,) * 3, (0.05,) * 3, (0.055,) * 3))
-    found = as_told(grainy, 3.5 / 255.0)
+    found = as_told(grainy, 4.0 / 255.0)
     assert found is not None and found.strength[:2] == grainy.strength[:2]
     assert found.strength[2] == pytest.approx((EXCESS * 0.04,) * 3)
+
+
+def test_lawn_is_no_heavy_grain() -> None:
+    """Grass fills the photo, and no patch of it is flat: 26 codes by these alone."""
+    grass = np.repeat(data.grass()[..., None], 3, axis=2).astype(np.float32) / 255.0
+    flat = estimate_grain(grass)
+    assert flat is not None and 255.0 * flat.of_luminance > 20.0
+    found = estimate_look(grass, gamma_to_linear(grass), None, "off").grain
+    assert found is not None and 255.0 * found.of_luminance < 4.0
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])

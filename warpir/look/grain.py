@@ -48,7 +48,7 @@ the noise of a sensor changes little over the display values of a picture. Also 
 tells over flat patches (`as_told`)."""
 WIDEST = 2.0
 """Largest standard deviation of the blur that stands for the grain's size [px]."""
-HEAVY = (3.0 / 255.0, 6.0 / 255.0)
+HEAVY = (3.5 / 255.0, 6.0 / 255.0)
 """Luminance's grain by the texture, and by flat patches of the level with the least of it, beyond
 which flat patches count [1]: the networks have seen up to 6 codes, and tell 4 of all that is
 stronger. Rock and leaves look like grain as heavy, but not at every level."""
