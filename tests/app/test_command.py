@@ -122,14 +122,6 @@ def test_dotted_names_mean_the_same(tmp_path: Path) -> None:
     assert "no such flag" in refused([*NEEDED, "--output.report"]).what
 
 
-def test_steps_of_a_refinement_are_its_own() -> None:
-    """What was given stays."""
-    values = {"refine": "tone", "reuse": "r", "model": "m", "prompt": "p"}
-    assert InsertConfig(**values).settled().optimize.step_count == 200
-    assert InsertConfig(**values, steps=9).settled().optimize.step_count == 9
-    assert InsertConfig(model="m").settled().optimize.step_count == 600
-
-
 @pytest.mark.parametrize(
     ("values", "is_guided"),
     [
