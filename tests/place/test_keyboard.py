@@ -20,6 +20,8 @@ from tests.builders.programs.placing import (
 )
 from tests.place.test_lamps import SEEN
 
+pytestmark = [needs_chromium, pytest.mark.slow]
+
 
 def focused(opened: Opened) -> str:
     """Name of the handle, or id of the element, that has the focus."""
@@ -28,8 +30,6 @@ def focused(opened: Opened) -> str:
     return name
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_lamp_is_added_moved_and_removed(inputs: Path, tmp_path: Path) -> None:
     """It hangs in the upper middle, its knob has the focus, and that is never lost."""
     with placing(command(inputs, tmp_path / "out")) as opened:
@@ -48,8 +48,6 @@ def test_lamp_is_added_moved_and_removed(inputs: Path, tmp_path: Path) -> None:
         assert focused(opened) == "add-lamp"
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_focus_stays_while_something_is_made(inputs: Path, tmp_path: Path) -> None:
     """On Save, on Render here, and there again after Cancel; seconds are not read aloud."""
     said = {"state": "running", "kind": "preview", "line": "picture", "share": 0.5, "seconds": 3}
@@ -78,8 +76,6 @@ def test_focus_stays_while_something_is_made(inputs: Path, tmp_path: Path) -> No
         page.wait_for_selector("#picture:not([hidden])")
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_estimated_light_can_be_read(inputs: Path, tmp_path: Path) -> None:
     """What is written of it has WCAG's contrast of 4.5 on the panel; nothing dims it."""
     seen = """(element) => {
@@ -99,8 +95,6 @@ def test_estimated_light_can_be_read(inputs: Path, tmp_path: Path) -> None:
             assert (0.95 + 0.05) / (luminance + 0.05) > 4.5, name
 
 
-@needs_chromium
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "around"), [("stage", "#room"), ("zoom-in", "#zoom-in")])
 def test_focus_on_the_photo_is_seen(inputs: Path, tmp_path: Path, name: str, around: str) -> None:
     """A white frame is drawn where what lies in it and over it does not hide it."""
@@ -114,8 +108,6 @@ def test_focus_on_the_photo_is_seen(inputs: Path, tmp_path: Path, name: str, aro
         assert white[middle, :8].sum() == white[middle, -8:].sum() == 2
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_comma_is_a_decimal_sign(inputs: Path, tmp_path: Path) -> None:
     """1,5 is neither 15 nor nothing, typed or pasted."""
     with placing(command(inputs, tmp_path / "out"), 700, 500) as opened:
@@ -128,8 +120,6 @@ def test_comma_is_a_decimal_sign(inputs: Path, tmp_path: Path) -> None:
             assert opened.page.evaluate(STATE)["size"] == 1.5
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_refused_number_is_told(inputs: Path, tmp_path: Path) -> None:
     """What a field does not take is said, and what warpir can use is taken."""
     with placing(command(inputs, tmp_path / "out", "--fov", "150"), 700, 500) as opened:
@@ -150,8 +140,6 @@ def test_refused_number_is_told(inputs: Path, tmp_path: Path) -> None:
             assert float(page.input_value(f"#{field}")) == float(typed)
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_refusal_stays_where_saving_follows_at_once(inputs: Path, tmp_path: Path) -> None:
     """What is saved then is not what was typed; once something has changed, it is past."""
     with placing(command(inputs, tmp_path / "out"), 700, 500) as opened:

@@ -28,6 +28,8 @@ from warpir.core.arrays import Float64Array
 from warpir.place.stance import Stance
 from warpir.scene.camera import Camera
 
+pytestmark = [needs_chromium, pytest.mark.slow]
+
 ENDS = {
     "a": [[(-1.0, 0.2, -5.0), (2.0, 0.2, -5.0)], [(-1.0, 1.9, -7.0), (1.5, 1.9, -7.0)]],
     "b": [[(-1.2, 0.1, -4.0), (-1.2, 0.1, -7.0)], [(1.4, 1.2, -5.0), (1.4, 1.2, -8.0)]],
@@ -56,8 +58,6 @@ def lines_of(camera: Camera, axes: str, turn: float) -> dict[str, Any]:
     }
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_lines_tell_known_cameras(inputs: Path, tmp_path: Path) -> None:
     """Two axes give pose and focal length, three the principal point too, an upright photo its row.
 
@@ -120,8 +120,6 @@ def lay(opened: Opened, lines: dict[str, Any]) -> None:
         settle(opened)
 
 
-@needs_chromium
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [1100, 390])
 def test_lines_are_dragged_and_saved(inputs: Path, tmp_path: Path, width: int) -> None:
     """Lines that begin as the camera sees them change nothing; laid on edges they tell it."""
@@ -173,8 +171,6 @@ def test_lines_are_dragged_and_saved(inputs: Path, tmp_path: Path, width: int) -
     assert saved["fx"] == pytest.approx(upright["camera"]["fx"])
 
 
-@needs_chromium
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [1100, 390])
 def test_known_length_tells_the_height(inputs: Path, tmp_path: Path, width: int) -> None:
     """A pole and a distance on the ground, of a known camera, in closed form and on the page."""

@@ -37,6 +37,8 @@ from warpir.place.stance import stance_of
 from warpir.scene.camera import Camera, camera_from_fov, ground_point
 from warpir.scene.placement import place_asset
 
+pytestmark = [needs_chromium, pytest.mark.slow]
+
 
 def drag_away_and_back(opened: Opened, selector: str) -> None:
     """Drag the thumb of a slider and let it go where it was: it tells of no change then."""
@@ -105,8 +107,6 @@ def render(config: Path, out: Path) -> NDArray[np.bool_]:
     return matte
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_places_what_insert_renders(inputs: Path, tmp_path: Path) -> None:
     """Drag, turn, scale, tilt and save: warpir's mask is the page's silhouette, at two placements.
 
@@ -158,8 +158,6 @@ def test_page_places_what_insert_renders(inputs: Path, tmp_path: Path) -> None:
     assert (masks[0][0] ^ masks[1][0]).sum() > 1000
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_counts_as_the_camera_does(inputs: Path, tmp_path: Path) -> None:
     """The page's projection, ground points and horizon are warpir's, by closed form."""
     camera = Camera(WIDTH, HEIGHT, 510.0, 470.0, 251.0, 143.0, TILTED.c2w())
@@ -258,8 +256,6 @@ def check_behind(opened: Opened) -> None:
     press(opened, "Control+z")
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_keeps_what_was_given(inputs: Path, tmp_path: Path) -> None:
     """A camera that looks straight down, and a sun under a black sky, come out as they went in."""
     out = tmp_path / "out"
@@ -283,8 +279,6 @@ def test_page_keeps_what_was_given(inputs: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(pose[:3, 2], [0.0, 1.0, 0.0], atol=EXACT)
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_redraw_leaves_what_is_being_typed(inputs: Path, tmp_path: Path) -> None:
     """An estimate that arrives, or any other redraw, does not take a number back."""
     with placing(command(inputs, tmp_path / "out"), 1000, 700) as opened:
@@ -301,8 +295,6 @@ def test_redraw_leaves_what_is_being_typed(inputs: Path, tmp_path: Path) -> None
         assert state["size"] == 1.25 and state["ruler"]["metres"] == 0.75
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_what_is_typed_counts_before_what_follows(inputs: Path, tmp_path: Path) -> None:
     """A drag, Save and undo by keys take a number whose field was not left."""
     out = tmp_path / "out"
@@ -333,8 +325,6 @@ Object.defineProperty(window, "sessionStorage", { get: refuse });
 window.BroadcastChannel = refuse;"""
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: Path) -> None:
     """The field counts the view across; an estimate is of the vertical one."""
     with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
@@ -356,8 +346,6 @@ def test_page_tells_how_far_the_view_across_may_be_off(inputs: Path, tmp_path: P
         assert said == f"Estimated from the photo: view ± {10.0 * across / vertical:.1f}°."
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_that_is_loaded_again_goes_on(inputs: Path, tmp_path: Path) -> None:
     """Whatever was placed, lit and painted is there again; undo leads to the page's start."""
     with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
@@ -382,8 +370,6 @@ def test_page_that_is_loaded_again_goes_on(inputs: Path, tmp_path: Path) -> None
         assert page.evaluate(STATE) == begun
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_second_tab_is_told_of_a_save(inputs: Path, tmp_path: Path) -> None:
     """Both save into one file: its placement was replaced without a word."""
     with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
@@ -400,8 +386,6 @@ def test_second_tab_is_told_of_a_save(inputs: Path, tmp_path: Path) -> None:
             told.page.wait_for_selector("#done", state="hidden")
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_does_without_storage(inputs: Path, tmp_path: Path) -> None:
     """A browser that refuses it refuses channels between tabs too: the page stayed empty."""
     with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
@@ -411,8 +395,6 @@ def test_page_does_without_storage(inputs: Path, tmp_path: Path) -> None:
         save(opened)
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_tells_of_a_browser_that_cannot_draw(inputs: Path, tmp_path: Path) -> None:
     with serve(command(inputs, tmp_path / "out")) as served, open_browser() as opened:
         opened.page.add_init_script(NO_WEBGL)
@@ -423,8 +405,6 @@ def test_page_tells_of_a_browser_that_cannot_draw(inputs: Path, tmp_path: Path) 
         assert "graphics acceleration" in opened.page.inner_text("#loading")
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> None:
     """Save and the last field can be reached, and a second finger does not break a drag."""
     with placing(command(inputs, tmp_path / "out"), 640, 360) as opened:
@@ -472,8 +452,6 @@ def test_page_serves_small_windows_and_fingers(inputs: Path, tmp_path: Path) -> 
             assert min(apart) > 25.5, (turn, apart)
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_undoes_and_tells_what_is_wrong(inputs: Path, tmp_path: Path) -> None:
     """Undo and redo, fields, double click; a file that came meanwhile is not replaced; --once."""
     out = tmp_path / "out"

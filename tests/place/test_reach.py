@@ -20,6 +20,8 @@ from tests.builders.programs.placing import (
     pull,
 )
 
+pytestmark = [needs_chromium, pytest.mark.slow]
+
 
 def away(state: dict[str, Any]) -> float:
     """Distance of the object over the camera's height."""
@@ -27,8 +29,6 @@ def away(state: dict[str, Any]) -> float:
     return float(np.hypot(stand["x"] - stance["x"], stand["z"] - stance["z"]) / stance["height"])
 
 
-@needs_chromium
-@pytest.mark.slow
 @pytest.mark.parametrize("width", [1000, 390])
 def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, width: int) -> None:
     """Dragged to the foot, below it and below the photo: the object stays in it, and comes back."""
@@ -57,8 +57,6 @@ def test_horizon_never_throws_the_object_away(inputs: Path, tmp_path: Path, widt
         assert float(page.input_value("#pitch")) == pytest.approx(before["stance"]["pitch"])
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_handles_stand_beside_the_object_on_a_phone(inputs: Path, tmp_path: Path) -> None:
     """None covers it, they are apart, and each does what it does elsewhere."""
     argv = command(inputs, tmp_path / "out", "--size", "2.5")

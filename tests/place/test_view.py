@@ -21,6 +21,8 @@ from tests.builders.programs.placing import (
     settle,
 )
 
+pytestmark = [needs_chromium, pytest.mark.slow]
+
 
 def photo_box(opened: Opened) -> tuple[float, float, float, float]:
     """Left, top, width and height of the photo, in pixels of the window."""
@@ -51,8 +53,6 @@ def check_agreement(opened: Opened) -> None:
     assert drawn == pytest.approx(wanted, abs=0.6)
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_page_zooms_where_the_pointer_is(inputs: Path, tmp_path: Path) -> None:
     """What is under the pointer stays there; placing goes on at any zoom; undo leaves it alone."""
     with placing(command(inputs, tmp_path / "out"), 1000, 640) as opened:
@@ -102,8 +102,6 @@ def test_page_zooms_where_the_pointer_is(inputs: Path, tmp_path: Path) -> None:
         assert page.evaluate(STATE) == before
 
 
-@needs_chromium
-@pytest.mark.slow
 def test_fingers_zoom_and_do_not_move_the_object(inputs: Path, tmp_path: Path) -> None:
     """A pinch whose first finger was on the object zooms, and takes back what that had moved."""
     argv = command(inputs, tmp_path / "out", "--size", "4")
