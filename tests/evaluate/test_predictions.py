@@ -188,12 +188,6 @@ def test_tilted_map_keeps_its_flux(place: tuple[float, float], tolerance: float)
     assert after == pytest.approx(before, rel=tolerance)
 
 
-def test_constant_map_stays_constant() -> None:
-    texels = np.full((32, 64, 3), 2.0, np.float32)
-    for frame in ("camera", "level"):
-        assert np.allclose(to_world(texels, view(12.0, -40.0), frame), 2.0, rtol=1e-6)
-
-
 # ---------------------------------------------------------------------------------------- reading
 
 
