@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -124,17 +124,24 @@ def test_given_values_are_no_frames(
     assert first["frame"] == "0002" and "response" not in first
 
 
+def begun_again(
+    film: tuple[list[str], Path, Run], folder: Path, second: Callable[[list[str]], str]
+) -> tuple[list[str], Path]:
+    """Give the done sequence another second line, whose frame is not done."""
+    argv, done, _ = film
+    out = shutil.copytree(done, folder / "out")
+    lines = Path(argv[argv.index("--sequence") + 1]).read_text().splitlines()
+    lines[1] = second(lines)
+    (folder / "s.jsonl").write_text("\n".join(lines))
+    shutil.rmtree(out / "0002")
+    return [*argv, "--sequence", str(folder / "s.jsonl"), "--out", str(out)], out
+
+
 def test_frames_of_an_earlier_look_are_told(
     film: tuple[list[str], Path, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The frame that tells the look is another photo since; the rest is done already."""
-    argv, done, _ = film
-    out = shutil.copytree(done, tmp_path / "out")
-    lines = Path(argv[argv.index("--sequence") + 1]).read_text().splitlines()
-    lines[1] = lines[2]
-    (tmp_path / "s.jsonl").write_text("\n".join(lines))
-    argv = [*argv, "--sequence", str(tmp_path / "s.jsonl"), "--out", str(out)]
-    shutil.rmtree(out / "0002")
+    argv, out = begun_again(film, tmp_path, lambda lines: lines[2])
     assert main(argv) == ExitCode.DONE
     assert "notice: 0001, 0003, of an earlier run, have another" in capsys.readouterr().out
     for name in ("0001", "0003"):
@@ -147,13 +154,8 @@ def test_frames_rendered_now_are_not_of_an_earlier_run(
     film: tuple[list[str], Path, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where the frame that tells the look now is done already, and has the earlier one itself."""
-    argv, done, _ = film
-    out = shutil.copytree(done, tmp_path / "out")
-    lines = Path(argv[argv.index("--sequence") + 1]).read_text().splitlines()
-    lines[1] = json.dumps({**json.loads(lines[1]), "place": [0, 0, 50]})
-    (tmp_path / "s.jsonl").write_text("\n".join(lines))
-    argv = [*argv, "--sequence", str(tmp_path / "s.jsonl"), "--out", str(out)]
-    shutil.rmtree(out / "0002")
+    unseen = {"place": [0, 0, 50]}
+    argv, out = begun_again(film, tmp_path, lambda lines: json.dumps(json.loads(lines[1]) | unseen))
     assert main(argv) == ExitCode.DONE
     assert record_of(out / "0002")["measured"]["look"]["frame"] == "0003"
     assert "notice: 0001, 0003, of an earlier run, have another" in capsys.readouterr().out
