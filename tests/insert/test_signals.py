@@ -406,9 +406,14 @@ def test_full_disk_keeps_old_results_and_checkpoints(
 def test_full_file_system(
     guided_inputs: Path, finished: Path, tmp_path: Path, small_disk: Callable[[str], Path]
 ) -> None:
-    """A real one, another than that of temporary files, which others fill meanwhile."""
+    """A real one, another than that of temporary files, which others fill meanwhile.
+
+    On one core the files are written one by one, so it is always the same that has no room.
+    """
     disk = small_disk("64m")
-    fill = "lambda: open('filler', 'wb').write(bytes(shutil.disk_usage('.').free - 1_420_000))"
+    fill = "open('filler', 'wb').write(bytes(shutil.disk_usage('.').free - 1_420_000))"
+    one_core = "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
+    fill = f"lambda: ({fill}, {one_core})"
     ended = guided(guided_inputs, disk, before="import shutil\n" + hook(WRITE, 1, fill))
     assert ended.status == ExitCode.RESOURCES, ended.err
     assert ended.err.startswith("error: out/envmap.hdr: written incompletely")
