@@ -1,30 +1,31 @@
 """How well the ground in a photo tells the level of the light: albedos of panoramas' grounds.
 
-    python -m benchmarks.light.ground_albedo --panoramas DIR --assets DIR [--crops 8] [--json FILE]
+    python -m benchmarks.light.ground_albedo --panoramas DIR --assets DIR [--crops 8] [--seed 3]
+        [--json FILE]
 
 Crops of every panorama are photographs as `warpir.evaluate` makes them, each with a place for an
 object. The ground's radiance near it times pi, over the irradiance that the panorama gives level
 ground, is the ground's albedo; under the regressed light it is the implied albedo. A panorama is
-judged by the networks that have not learned from it. The panoramas, in the order of their names,
-are dealt in turn to two halves: location, scale and degrees of freedom of the albedo's logarithm
-are fitted on the first, and the second says how far the level of the regressed light is off, before
-and after the ground is asked (`warpir.lighting.exposure`).
+judged by the networks that have not learned from it. Two ways to let the ground change the light's
+level are measured: to lower a light under which the ground would be darker than grounds are, and to
+weigh the albedo against the usual one as well. `warpir.insert` does neither, see
+`docs/evaluation.md`.
 """
 
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
-from benchmarks.measure import flags, rms, write_json
+from benchmarks.measure import flags, write_json
 from benchmarks.scenes import panoramas_of, photo_of
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array, FloatArray
 from warpir.core.color import luminance
+from warpir.core.errors import InputError
 from warpir.core.latlong import map_directions, resize_map, texel_solid_angles
 from warpir.evaluate.scenes import ASSET_SUFFIXES, Places, Subject, find_files
 from warpir.evaluate.stage import unseen_by
-from warpir.lighting.exposure import ALBEDO, ask_ground, level_log_std
+from warpir.lighting.exposure import DARK, ask_ground
 from warpir.lighting.regression import regress
 from warpir.lighting.regressor import Regressor, load_regressor
 from warpir.scene.light import Light, as_map, fibonacci
@@ -32,6 +33,8 @@ from warpir.scene.light import Light, as_map, fibonacci
 UP = np.array([0.0, 1.0, 0.0])
 ROWS = 128
 """Of the maps that irradiances are summed from."""
+LOWER_MAX = float(np.log(2.0))
+"""Logarithm of the factor that a light is lowered by at most [1]: some floors are black."""
 NORMALS = 128
 """Directions over the sphere; those toward the camera stand for the object."""
 
@@ -41,19 +44,12 @@ class Crop:
     """Natural logarithms for one photograph, and what the witnesses say."""
 
     panorama: str
-    is_sunny: bool
     albedo: float
     """Of the ground's albedo under the true light."""
     implied: float
     """Of that under the regressed light."""
     level: float
     """Of the factor on the regressed light that fits the object's irradiance best."""
-    ground_level: float
-    """Of the factor that makes the irradiance of the ground right."""
-    log_std: float
-    """What the regressor says of the ground's irradiance."""
-    change: float
-    """Of the factor that both witnesses give."""
 
 
 def crop_of(subject: Subject, network: Regressor) -> Crop | None:
@@ -70,16 +66,11 @@ def crop_of(subject: Subject, network: Regressor) -> Crop | None:
     regressed = as_map(Light(lobes=regression.lobes()), ROWS)
     on_ground = [irradiance(texels, UP[None])[0] for texels in (true, regressed)]
     wanted, given = irradiance(true, normals), irradiance(regressed, normals)
-    ratio = float(np.log(on_ground[0] / on_ground[1]))
     return Crop(
         place.panorama,
-        place.is_sunny,
-        float(np.log(ground.implied)) - ratio,
+        float(np.log(ground.implied * on_ground[1] / on_ground[0])),
         float(np.log(ground.implied)),
         float(np.log(wanted @ given / (given @ given))),
-        ratio,
-        level_log_std(regression, UP),
-        ground.weighed * float(np.log(2.0)),
     )
 
 
@@ -92,37 +83,52 @@ def irradiance(texels: FloatArray, normals: Float64Array) -> Float64Array:
     return total
 
 
-def describe(crops: list[Crop], name: str) -> None:
-    """Print how far levels are off, before and after the ground is asked."""
-    for words, chosen in (
-        ("all", crops),
-        ("sunny", [c for c in crops if c.is_sunny]),
-        ("other", [c for c in crops if not c.is_sunny]),
-    ):
-        if not chosen:
-            continue
-        values = {k: np.array([asdict(c)[k] for c in chosen]) for k in
-                  ("albedo", "implied", "level", "ground_level", "log_std", "change")}  # fmt: skip
-        level, after = values["level"], values["level"] - values["change"]
-        places = len({c.panorama for c in chosen})
-        print(
-            f"{name}, {words}: {len(chosen)} crops of {places} places; albedo: median "
-            f"{np.exp(np.median(values['albedo'])):.3f}, log std {values['albedo'].std():.2f}; "
-            f"implied: median {np.exp(np.median(values['implied'])):.3f}, log std "
-            f"{values['implied'].std():.2f}"
-        )
-        print(
-            f"    log level of the object: mean absolute {abs(level).mean():.3f} -> "
-            f"{abs(after).mean():.3f}, RMS {rms(level):.3f} -> {rms(after):.3f}; the regressor "
-            f"says {rms(values['log_std']):.2f} of the ground's, whose RMS is "
-            f"{rms(values['ground_level']):.2f}"
-        )
+def weigh(first: list[Crop], second: list[Crop]) -> None:
+    """Print the gain of the best weight for the ground beside the bound, fitted on one half."""
+    usual = float(np.median([c.albedo for c in first]))
+    (implied, level), (implied_2, level_2) = (held(half, DARK) for half in (first, second))
+    weight = float((implied - usual) @ level / ((implied - usual) @ (implied - usual)))
+    after = level_2 - weight * (implied_2 - usual)
+    print(
+        f"first half: median albedo {np.exp(usual):.3f}, log std "
+        f"{columns(first, 'albedo')[0].std():.2f}, best weight beside the bound {weight:.2f}; "
+        f"second half: log level {abs(level_2).mean():.3f} -> {abs(after).mean():.3f}"
+    )
+
+
+def held(crops: list[Crop], darkest: float) -> list[Float64Array]:
+    """Return implied albedos and levels, in logarithms, after the bound."""
+    implied, level = columns(crops, "implied", "level")
+    lower = np.clip(np.log(darkest) - implied, 0.0, LOWER_MAX)
+    return [implied + lower, level + lower]
+
+
+def bound(crops: list[Crop], darkest: float) -> None:
+    """Print what it brings to hold the light to ground that is no darker."""
+    albedo, level = columns(crops, "albedo", "level")
+    _, after = held(crops, darkest)
+    acts = after != level
+    gain = abs(level) - abs(after)
+    names = np.array([c.panorama for c in crops])
+    of_place = np.array([gain[acts & (names == name)].mean() for name in np.unique(names[acts])])
+    print(
+        f"no ground darker than {darkest:.3f} ({(np.exp(albedo) < darkest).mean():.1%} are): log "
+        f"level {abs(level).mean():.3f} -> {abs(after).mean():.3f}; acts on {acts.sum()} crops of "
+        f"{len(of_place)} places, there {abs(level[acts]).mean():.2f} -> "
+        f"{abs(after[acts]).mean():.2f}, better in {(of_place > 0.0).sum()} places"
+    )
+
+
+def columns(crops: list[Crop], *names: str) -> list[Float64Array]:
+    """Return the named figures, each an array of shape [crop]."""
+    return [np.array([getattr(c, name) for c in crops]) for name in names]
 
 
 def main() -> None:
     """Measure, and print."""
     parser = flags(__doc__, "panoramas", "objects", "json")
     parser.add_argument("--crops", type=int, default=8, help="of each panorama")
+    parser.add_argument("--seed", type=int, default=3, help="of the views and objects")
     options = parser.parse_args()
     assets = find_files(options.assets, ASSET_SUFFIXES, "--assets")
     network = load_regressor(None)
@@ -132,16 +138,18 @@ def main() -> None:
         if unseen is None:
             print(f"{path.stem}: left out, all networks have learned from it")
             continue
-        places = Places([path], assets, seed=3, width=192)
+        try:
+            places = Places([path], assets, seed=options.seed, width=192)
+        except InputError as error:
+            print(f"{path.stem}: left out, {error}")
+            continue
         crops = (crop_of(subjects[0], unseen) for _, subjects in places.make(options.crops))
         halves[k % 2] += [crop for crop in crops if crop is not None]
-    freedom, location, scale = student.fit(np.array([c.albedo for c in halves[0]]))
-    print(
-        f"first half: the albedo's logarithm is Student's t with {freedom:.1f} degrees of freedom "
-        f"about {np.exp(location):.3f}, scale {scale:.2f} (in use: {ALBEDO:g})"
-    )
-    describe(halves[0], "first half")
-    describe(halves[1], "second half")
+    crops = halves[0] + halves[1]
+    print(f"{len(crops)} crops of {len({c.panorama for c in crops})} places")
+    weigh(*halves)
+    for darkest in (0.015, 0.02, DARK, 0.03, 0.04):
+        bound(crops, darkest)
     write_json(options.json, [[asdict(c) for c in half] for half in halves], indent=None)
 
 

@@ -22,10 +22,9 @@ from warpir.core.errors import InputError
 from warpir.core.latlong import rotate_map
 from warpir.evaluate.scenes import CAMERA_HEIGHT, Place, Subject, mirrored, turned_to
 from warpir.evaluate.stage import Bench, Prediction, Stage, unseen_by
-from warpir.io.images.photos import Photo, read_photo
+from warpir.io.images.photos import read_photo
 from warpir.io.images.writers import png_bytes
 from warpir.io.results import OutputFolder
-from warpir.lighting.exposure import ask_ground
 from warpir.lighting.fit import fit_lobes
 from warpir.lighting.regression import Regression, mean_training_light, regress
 from warpir.lighting.regressor import Regressor
@@ -129,7 +128,8 @@ def mean_training(bench: Bench, place: Place) -> Prediction:
 
 def regression(network: Regressor, place: Place) -> Prediction:
     """Return the light that a regressor estimates, with the sun where the photograph shows it."""
-    estimate = _estimate(network, place)
+    estimate = regress(network, place.photo, place.camera)
+    estimate = with_visible_sun(estimate, place.photo, place.camera)
     about: dict[str, Any] = {"spread_deg": estimate.spread_deg, "sun_in_view": estimate.sun_in_view}
     if estimate.sun_in_view is None:
         about["truth_mass"] = _truth_mass(estimate, place)
@@ -159,22 +159,6 @@ def regression_with_estimated_camera(bench: Bench, place: Place) -> Prediction:
     camera = turned_to(found.camera(width, height, CAMERA_HEIGHT), place.azimuth)
     network = bench.network_for(place.panorama)
     return regression(network, replace(place, camera=camera))
-
-
-def regression_on_ground(bench: Bench, stage: Stage, subject: Subject) -> Prediction:
-    """Return what the regressor sees, its level weighed against the ground's."""
-    place = subject.place
-    estimate = _estimate(bench.network_for(place.panorama), place)
-    photo = Photo(np.round(255.0 * place.photo).astype(np.uint8), place.photo, "png")
-    ground = ask_ground(estimate, Inputs(photo, subject.asset, place.camera, subject.placement))
-    gain = 1.0 if ground is None else 2.0**ground.weighed
-    light = Light(lobes=estimate.lobes()).scaled(gain)
-    return Prediction.of(light, spread_deg=estimate.spread_deg)
-
-
-def _estimate(network: Regressor, place: Place) -> Regression:
-    estimate = regress(network, place.photo, place.camera)
-    return with_visible_sun(estimate, place.photo, place.camera)
 
 
 def other_photo(bench: Bench, place: Place) -> Prediction:
@@ -348,13 +332,6 @@ ROWS = {
         of_place=regression_with_estimated_camera,
         start="regression",
         needs=("regressor", "calibrator"),
-    ),
-    "regression-ground": Row(
-        "methods",
-        "the same, its level weighed against the ground's albedo",
-        of_subject=regression_on_ground,
-        start="regression",
-        needs=("regressor",),
     ),
     "lds-uniform": Row(
         "methods",

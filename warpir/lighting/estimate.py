@@ -10,7 +10,7 @@ import numpy as np
 
 from warpir.app.inputs import Inputs
 from warpir.app.settings import LightConfig
-from warpir.lighting.exposure import GroundWitness, ask_ground
+from warpir.lighting.exposure import DARK, GroundWitness, ask_ground
 from warpir.lighting.regression import Regression, regress
 from warpir.lighting.regressor import load_regressor
 from warpir.lighting.scene_light import SceneLight, start_level
@@ -105,13 +105,13 @@ def _describe_level(ground: GroundWitness | None) -> str:
             "the light's level is the estimated one: the photo shows too little of the ground to "
             "check it (--exposure)"
         )
-    if ground.is_stated:
+    if ground.stops:
         return (
             f"the light is {ground.stops:+.2f} EV from the estimated one: the albedo of the "
             f"ground is {ground.albedo:.2g} instead of {ground.implied:.2g} (--exposure)"
         )
+    doubt = ", which few grounds have: it may be too strong" if ground.implied < DARK else ""
     return (
         "the light's level is the estimated one, under which the ground's albedo is "
-        f"{ground.implied:.2g}; weighed against what grounds have, it would be "
-        f"{ground.weighed:+.2f} EV (--ground-albedo, --exposure)"
+        f"{ground.implied:.2g}{doubt} (--ground-albedo, --exposure)"
     )

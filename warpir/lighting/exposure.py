@@ -1,15 +1,16 @@
-"""The level of an estimated light, by two witnesses: the regressor, and the ground in the photo.
+"""The albedo of the ground under an estimated light, and what a stated one says of its level.
 
 The regressor's levels are relative to the photo's mean luminance. The ground's radiance times pi,
-over the irradiance that the light gives it, is its albedo, and albedos of grounds are log-normal.
-With x the natural logarithm of the factor on the light, s the regressor's standard deviation and a
-the albedo that the ground would have under the light as it was regressed,
+over the irradiance that the light gives it, is its albedo. Where the user states the albedo, both
+witnesses are weighed. With x the natural logarithm of the factor on the light, s the regressor's
+standard deviation, a the albedo that the ground would have under the light as it was regressed and
+A the stated one,
 
     p(x) ~ exp(-x^2 / (2 s^2)) (1 + (ln a - x - ln A)^2 / (n S^2))^(-(n + 1) / 2),
 
-whose mean is taken. Student's t in place of the normal lets snow, asphalt and ground in the shade
-count for little. On places that the regressor has not seen this helps too little to be trusted
-(``docs/evaluation.md``): it is shown, and put on the light where the user states the albedo.
+whose mean is taken. Student's t in place of the normal lets ground in the shade count for little.
+Without the user's word the light stays: what is known of grounds in general makes no picture better
+of a place that the regressor has not seen (``docs/evaluation.md``).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 from warpir.app.inputs import Inputs
 from warpir.core.arrays import Float64Array
 from warpir.core.color import luminance
-from warpir.lighting.regression import LOG_STD_MAX, Regression
+from warpir.lighting.regression import Regression
 from warpir.lighting.scene_light import (
     GROUND_PERCENTILE,
     believed,
@@ -34,13 +35,11 @@ from warpir.lighting.scene_light import (
 )
 from warpir.scene.light import Light
 
-ALBEDO = 0.19
-"""Median albedo of the ground over some 300 panoramas [1]; the next constants fit 45 places, see
-``docs/evaluation.md``."""
-ALBEDO_LOG_STD = 0.8
-"""Scale of its natural logarithm [1]."""
+DARK = 0.025
+"""Under this albedo of the ground a light is mostly too strong [1], see ``docs/evaluation.md``."""
 STATED_LOG_STD = 0.3
-"""The same for an albedo that the user states: ground has a texture, and parts in the shade [1]."""
+"""Scale of the natural logarithm of the ground's albedo about the stated one [1]: ground has a
+texture, and parts in the shade."""
 FREEDOM = 3.0
 """Degrees of freedom of Student's t [1]."""
 DOUBT = 1.4
@@ -65,15 +64,8 @@ class GroundWitness:
 
     implied: float
     """Albedo that the ground would have under the light as it was regressed [1]."""
-    weighed: float
-    """Change of all of the light that both witnesses give [EV]."""
-    is_stated: bool
-    """Whether the user states the albedo; only then the light is changed."""
-
-    @property
-    def stops(self) -> float:
-        """Change that is put on all of the light [EV]."""
-        return self.weighed if self.is_stated else 0.0
+    stops: float
+    """Change that is put on all of the light [EV]; 0 where the user states no albedo."""
 
     @property
     def albedo(self) -> float:
@@ -82,18 +74,13 @@ class GroundWitness:
 
     def record(self) -> dict[str, Any]:
         """Return plain values for ``run.json``."""
-        return {
-            "implied_albedo": self.implied,
-            "albedo": self.albedo,
-            "weighed_stops": self.weighed,
-            "stops": self.stops,
-        }
+        return {"implied_albedo": self.implied, "albedo": self.albedo, "stops": self.stops}
 
 
 def ask_ground(
     regression: Regression, inputs: Inputs, stated: float | None = None
 ) -> GroundWitness | None:
-    """Weigh the regressor's level against the ground between the camera and past the object.
+    """Check the regressor's level by the ground between the camera and past the object.
 
     Args:
         regression: The light, photo-linear units.
@@ -115,14 +102,10 @@ def ask_ground(
         return None
     level = believed(float(np.percentile(seen, GROUND_PERCENTILE)), inputs.photo)
     implied = math.pi * level / irradiance
+    if stated is None:
+        return GroundWitness(implied, 0.0)
     log_std = DOUBT * level_log_std(regression, normal)
-    if stated is not None:
-        change = expected_change(math.log(implied / stated), log_std, STATED_LOG_STD)
-    else:
-        # Less sure of itself, it would let the light follow a black floor.
-        log_std = min(log_std, LOG_STD_MAX)
-        change = expected_change(math.log(implied / ALBEDO), log_std, ALBEDO_LOG_STD)
-    return GroundWitness(implied, change / math.log(2.0), stated is not None)
+    return GroundWitness(implied, expected_stops(math.log(implied / stated), log_std))
 
 
 def ground_in_view(inputs: Inputs) -> tuple[Float64Array, int]:
@@ -162,15 +145,15 @@ def level_log_std(regression: Regression, normal: Float64Array) -> float:
     return math.hypot((1.0 - share) * regression.sun_log_std, share * regression.ambient_log_std)
 
 
-def expected_change(excess: float, log_std: float, albedo_log_std: float) -> float:
-    """Return the mean of the log factor on the light, given both witnesses [1].
+def expected_stops(excess: float, log_std: float) -> float:
+    """Return the mean change of the light, given both witnesses [EV].
 
-    The excess is the natural logarithm of implied over expected albedo; the others are standard
-    deviation and scale of the logarithms of the regressed level and of the albedo.
+    The excess is the natural logarithm of implied over stated albedo; the other is the standard
+    deviation of the logarithm of the regressed level.
     """
     change = np.linspace(-LOG_FACTOR_MAX, LOG_FACTOR_MAX, 4001)
-    misfit = (excess - change) / albedo_log_std
+    misfit = (excess - change) / STATED_LOG_STD
     log_density = -0.5 * (change / log_std) ** 2
     log_density -= 0.5 * (FREEDOM + 1.0) * np.log1p(misfit**2 / FREEDOM)
     density = np.exp(log_density - log_density.max())
-    return float(density @ change / density.sum())
+    return float(density @ change / density.sum() / math.log(2.0))

@@ -205,8 +205,7 @@ def light_sources(record: Mapping[str, Any], asked: LightConfig) -> Rows:
     if ground := measured.get("ground"):
         text = (
             f"{ground['implied_albedo']:.2g} under the light as it was regressed, "
-            f"{ground['albedo']:.2g} after {ground['stops']:+.2f} EV on all of the light; both "
-            f"witnesses of its level together give {ground['weighed_stops']:+.2f} EV"
+            f"{ground['albedo']:.2g} after {ground['stops']:+.2f} EV on all of the light"
         )
         rows.append(("albedo of the ground", text))
     if "detail_seen" in measured:
