@@ -5,10 +5,10 @@ With ``by noise`` it has more samples where their noise would be seen, as an ins
 
     python -m benchmarks.denoise --panoramas DIR --assets FILE ... --scenes 4
 
-Crops of panoramas with an object under the crop's light, as in `benchmarks.look`, against a
-rendering of many samples. Errors are root mean squares of display values in codes of 255, of the
-object's pixels and of those that its shadow changes; seconds are those of the whole picture, so
-two rows of equal time can be compared.
+Crops of panoramas with an object under the crop's light, as in `benchmarks.look.composites`,
+against a rendering of many samples. Errors are root mean squares of display values in codes of 255,
+of the object's pixels and of those that its shadow changes; seconds are those of the whole picture,
+so two rows of equal time can be compared.
 """
 
 import json

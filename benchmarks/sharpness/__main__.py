@@ -2,11 +2,11 @@
 
     python -m benchmarks.sharpness --panoramas DIR [--photos DIR] [--fit]
 
-Crops of panoramas pass through the cameras of `benchmarks.look`, and edges are looked for round
-where an object might stand. What is to be found is the camera's blur with the crop's own
-(`benchmarks.look.softness`). Places are halved as in `benchmarks.response`: the numbers of
-`warpir.look.sharpness` were chosen by the one half, and both are judged. Photographs are made 3, 4
-and 5 times smaller, hence sharp, and are then blurred by a known Gaussian. The grain is the
+Crops of panoramas pass through the cameras of `benchmarks.look.composites`, and edges are looked
+for round where an object might stand. What is to be found is the camera's blur with the crop's own
+(`benchmarks.look.composites.softness`). Places are halved as in `benchmarks.response`: the numbers
+of `warpir.look.sharpness` were chosen by the one half, and both are judged. Photographs are made 3,
+4 and 5 times smaller, hence sharp, and are then blurred by a known Gaussian. The grain is the
 luminance's, in codes of 255 in the middle of the range. ``--fit`` trains the networks of
 `warpir.look.texture` first (`benchmarks.sharpness.fit`).
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.look import draw_camera, softness
+from benchmarks.look.composites import draw_camera, softness
 from benchmarks.measure import flags, rms
 from benchmarks.scenes import is_for_fitting, panoramas_of
 from benchmarks.sharpness.fit import fit, shown_crop

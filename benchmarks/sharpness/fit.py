@@ -2,7 +2,7 @@
 
 Three kinds: crops of the places that numbers are chosen by, photographs that scikit-image brings
 and that are made smaller, hence sharp, and made-up leaves (Lee, Mumford and Huang 2001, "Occlusion
-models for natural images"). All pass through the cameras of `benchmarks.look`.
+models for natural images"). All pass through the cameras of `benchmarks.look.composites`.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from PIL import Image
 from safetensors.numpy import save_file
 from scipy import ndimage
 
-from benchmarks.look import draw_camera, softness
+from benchmarks.look.composites import draw_camera, softness
 from warpir.core.arrays import BoolArray, Float64Array, FloatArray
 from warpir.core.color import codes_of, expose, gamma_to_linear, linear_to_gamma
 from warpir.evaluate.scenes import CAMERA_HEIGHT, PITCH, crop_camera, crop_radiance

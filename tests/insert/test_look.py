@@ -19,6 +19,8 @@ from tests.builders.insertions import (
     untouched,
 )
 from tests.builders.outcome import outcome
+from tests.look.test_toning import TONES, a_scene
+from warpir.core.color import GAMMA, luminance
 from warpir.look.camera_look import CameraLook
 
 OFF = {"response": "off", "sharpness": "off", "grain": "off"}
@@ -95,7 +97,7 @@ def test_black_and_white_photo_has_a_grey_object(
     (tmp_path / "grey").mkdir()
     words = {"photo": str(photo), "device": device, **lamp}
     grey = go(arguments(inputs, tmp_path / "grey" / "out", **words), tmp_path / "grey" / "out")
-    assert grey.record["measured"]["look"]["grey"] is True
+    assert grey.record["measured"]["look"]["toning"]["offsets"] == [[0.0] * 3] * 9
     assert any("black and white" in line for line in grey.record["assumed"])
     # A code that comes out of a profile and goes back may be rounded either way.
     assert np.ptp(grey.image().astype(int), axis=-1).max() <= (profile is not None)
@@ -107,6 +109,29 @@ def test_black_and_white_photo_has_a_grey_object(
     off = tmp_path / "off" / "out"
     colored_run = go(arguments(inputs, off, **words, response="off"), off)
     assert np.ptp(colored_run.image().astype(int), axis=-1).max() > 20
+
+
+def test_toned_photo_has_a_toned_object(inputs: Path, tmp_path: Path, device: str) -> None:
+    """All of the picture lies on the photo's curve, unless the object's colours are asked for."""
+    photo = tmp_path / "photo.png"
+    codes = np.round(255.0 * np.clip(TONES["sepia"](a_scene()), 0.0, 1.0)).astype(np.uint8)
+    Image.fromarray(codes).save(photo)
+    words = {"photo": str(photo), "device": device, "grain": "off"}
+    off_curve = []
+    for name, more in (("toned", {}), ("off", {"response": "off"})):
+        (tmp_path / name).mkdir()
+        out = tmp_path / name / "out"
+        run = go(arguments(inputs, out, **words, **more), out)
+        says = any("toned black and white" in line for line in run.record["assumed"])
+        assert says == ("toning" in run.record["measured"]["look"]) == (not more)
+        # Where a pixel shows both, their mean is no longer on the curve.
+        matte = read_layers(out / "layers.exr")["fg.A"]
+        shown = run.image()[(matte == 1.0) | (matte == 0.0)] / 255.0
+        grey = luminance(shown**GAMMA) ** (1.0 / GAMMA)
+        toned = TONES["sepia"](np.linspace(0.0, 1.0, 1001))
+        nearest = np.searchsorted(luminance(toned**GAMMA) ** (1.0 / GAMMA), grey).clip(0, 1000)
+        off_curve.append(np.abs(shown - toned[nearest]).max(axis=-1))
+    assert off_curve[0].max() < 3.0 / 255.0 < 20.0 / 255.0 < np.quantile(off_curve[1], 0.97)
 
 
 @pytest.mark.parametrize("unit", [1.0 / 64.0, 64.0])

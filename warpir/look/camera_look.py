@@ -16,6 +16,7 @@ from warpir.look.grain import Grain, as_told, blocks_over, estimate_grain, grain
 from warpir.look.response import PLACED, Response, estimate_response
 from warpir.look.sharpness import PIXEL_SIGMA, EdgeBlur, blurred_layers, estimate_blur
 from warpir.look.texture import read_texture
+from warpir.look.toning import Toning, toning_of
 
 UPSAMPLED = 2.5
 """Variance of a rendered edge that was enlarged bilinearly, over that of its own pixel [1]."""
@@ -36,8 +37,8 @@ class CameraLook:
     grain: Grain | None = None
     response: Response | None = None
     jpeg: JpegCoding | None = None
-    is_grey: bool = False
-    """Whether the photo is black and white, and so are object and shadow."""
+    toning: Toning | None = None
+    """Of a black and white photo, which the object shares."""
     frame: str | None = None
     """Frame of a sequence whose photo told what is estimated of blur, grain and response; None:
     the photo itself."""
@@ -110,12 +111,24 @@ class CameraLook:
         bent = response.shadow_ratio(ratio, plate[shaded])
         planes["shadow_ratio"][shaded] = np.where(ratio == 1.0, ratio, bent)
 
-    def coloured_like_photo(self, planes: dict[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return the planes of `shown_like_photo`, and ``mirror``, grey if the photo is."""
-        if not self.is_grey:
+    def coloured_like_photo(
+        self, planes: dict[str, FloatArray], plate: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the planes of `shown_like_photo`, and ``mirror``, toned if the photo is."""
+        toning = self.toning
+        if toning is None:
             return planes
-        names = {*SUMMED, "shadow_ratio", "mirror"} & planes.keys()
-        return planes | {name: _as_grey(planes[name]) for name in names}
+        if toning.is_grey:
+            names = {*SUMMED, "shadow_ratio", "mirror"} & planes.keys()
+            return planes | {name: _as_grey(planes[name]) for name in names}
+        toned = planes | {name: planes[name].copy() for name in SUMMED}
+        parts = [toned[name] for name in SUMMED if name != "foreground"]
+        toning.on_object(toned["foreground"], parts, toned["matte"])
+        toned["shadow_ratio"] = toning.on_ground(planes["shadow_ratio"], plate)
+        if "mirror" in planes:
+            shaded = plate * toned["shadow_ratio"]
+            toned["mirror"] = toning.on_mirror(planes["mirror"], shaded)
+        return toned
 
     def grain_on(
         self,
@@ -129,20 +142,21 @@ class CameraLook:
         """Return what `grain_over` and then `blocks_over` add; None without both."""
         added, grain = None, self.grain
         if grain is not None:
-            if self.is_grey:  # the mean of channels that differ would be weaker
+            if self.toning is not None:  # the mean of channels that differ would be weaker
                 grain = replace(grain, correlation=1.0)
             added = grain_over(grain, composite, plate, matte, changed, seed, gamma)
             composite = composite + added
         if self.jpeg is not None:
             blocks = blocks_over(self.jpeg, composite, changed, gamma)
             added = blocks if added is None else added + blocks
-        return _as_grey(added) if self.is_grey and added is not None else added
+        return _as_grey(added) if self.toning is not None and added is not None else added
 
     def lines(self) -> list[str]:
         """Return what was estimated, a sentence each."""
         found = []
-        if self.is_grey:
-            found.append("the photo is black and white, and so is the object (--response off: not)")
+        if self.toning is not None:
+            words = "black and white" if self.toning.is_grey else "toned black and white"
+            found.append(f"the photo is {words}, and so is the object (--response off: not)")
         if self.response is not None:
             black = 255.0 * self.response.dark(np.array(PLACED[0])) ** (1.0 / GAMMA)
             found.append(
@@ -179,20 +193,17 @@ class CameraLook:
             "grain": None if self.grain is None else asdict(self.grain),
             **({} if self.response is None else {"response": asdict(self.response)}),
             **({} if self.jpeg is None else {"jpeg": {"quality": self.jpeg.quality}}),
-            **({"grey": True} if self.is_grey else {}),
+            **({} if self.toning is None else {"toning": asdict(self.toning)}),
             **({} if self.frame is None else {"frame": self.frame}),
         }
 
 
 def look_of_preview(photo: Photo, response: float | str) -> CameraLook:
-    """Return what a preview has of a photo's look: it is grey where that is black and white.
+    """Return what a preview has of a photo's look: its toning, where it is black and white.
 
-    That is where the channels of its codes are equal everywhere, but for a photo of one value.
     ``response`` is that of `estimate_look`; ``off`` leaves colours.
     """
-    codes = photo.codes
-    is_grey = response != "off" and bool((codes == codes[..., :1]).all())
-    return CameraLook(is_grey=is_grey and bool((codes != codes[0, 0]).any()))
+    return CameraLook(toning=None if response == "off" else toning_of(photo))
 
 
 def _as_grey(plane: FloatArray) -> FloatArray:

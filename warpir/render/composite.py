@@ -112,7 +112,7 @@ def composite(
     cut = 0
     if "image" in planes:
         after["mirror"], cut = shown_mirror(after, plate[box], curves, look)
-    after = look.coloured_like_photo(after)
+    after = look.coloured_like_photo(after, plate[box])
     if occluder is not None:
         after = _behind(after, occluder[box])
     after = {name: plane for name, plane in after.items() if plane is not before.get(name)}

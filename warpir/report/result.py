@@ -139,13 +139,12 @@ def _small_inputs(inputs: Inputs) -> Inputs:
 def look_of(run: Run, light: SceneLight, shared: CameraLook | None = None) -> CameraLook:
     """Return what the camera did to the photo, as far as the object is to share it.
 
-    ``shared`` is `estimated_look` of another frame: its blur, response and grain hold for this one.
+    ``shared`` is `estimated_look` of another frame, which holds for this one but for its JPEG.
     """
     photo, asked = run.inputs.photo, run.config.look
     look = replace(
         shared or estimated_look(run.inputs, asked, light.curves),
         jpeg=None if asked.grain == "off" else photo.jpeg,
-        is_grey=look_of_preview(photo, asked.response).is_grey,
     )
     words = {"blur": asked.sharpness, "grain": asked.grain, "response": asked.response}
     given: dict[str, Any] = {part: None for part, word in words.items() if word != "auto"}
@@ -154,7 +153,7 @@ def look_of(run: Run, light: SceneLight, shared: CameraLook | None = None) -> Ca
 
 
 def estimated_look(inputs: Inputs, asked: LookConfig, curves: Curves) -> CameraLook:
-    """Estimate blur, response and grain of a photo; what is given stays as it is.
+    """Estimate blur, response, grain and toning of a photo; what is given stays as it is.
 
     A recovered tone curve was judged beside the photo, so it holds the response already; Reinhard's
     operator has a shoulder of its own, and a linear plate has no response. A plate of any unit is
@@ -170,7 +169,8 @@ def estimated_look(inputs: Inputs, asked: LookConfig, curves: Curves) -> CameraL
     shown, factor = photo.exposed()
     linear = photo.linear() * np.float32(factor) if photo.is_linear else photo.linear()
     words = asked.sharpness, asked.grain, response
-    return estimate_look(shown, linear, around, *words, photo.jpeg)
+    look = estimate_look(shown, linear, around, *words, photo.jpeg)
+    return replace(look, toning=look_of_preview(photo, asked.response).toning)
 
 
 def _picture(

@@ -82,7 +82,7 @@ def _written(frame: Frame) -> list[Any]:
 
 
 def _parts(look: dict[str, Any]) -> list[Any]:
-    return [look.get(part) for part in ("blur", "grain", "response")]
+    return [look.get(part) for part in ("blur", "grain", "response", "toning")]
 
 
 def _kind(photo: Photo) -> Kind:

@@ -1,6 +1,6 @@
 """Blacks and fine contrast of an object beside the photo's own around it, before and after.
 
-    python -m benchmarks.look_pair OFF_DIR AUTO_DIR [--jpeg FILE]
+    python -m benchmarks.look.pair OFF_DIR AUTO_DIR [--jpeg FILE]
 
 Both folders are finished runs of one insertion, the first with ``--response off --sharpness off
 --grain off``. Blacks are the 1st percentile of the luminance, fine contrast is the mean absolute

@@ -1,6 +1,6 @@
 """What repeating a camera's look on the object is worth: pairs whose truth is known.
 
-    python -m benchmarks.look --panoramas DIR --assets DIR --scenes 20 --json FILE
+    python -m benchmarks.look.composites --panoramas DIR --assets DIR --scenes 20 --json FILE
 
 Panorama crops pass through a camera that is drawn: blur, response, grain by level, and in half of
 them the blocks of JPEG; the responses are those that the regressor trains with
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.look_pair import blacks_and_contrast
+from benchmarks.look.pair import blacks_and_contrast
 from benchmarks.measure import flags, write_json
 from benchmarks.response import LEVELS, codes_of, curve
 from benchmarks.scenes import is_for_fitting, panoramas_of, photo_of, places_of, renderer_of
