@@ -40,8 +40,8 @@ class CameraLook:
     toning: Toning | None = None
     """Of a black and white photo, which the object shares."""
     frame: str | None = None
-    """Frame of a sequence whose photo told what is estimated of blur, grain and response; None:
-    the photo itself."""
+    """Frame of a sequence whose photo told what is estimated but the JPEG coding; None: the photo
+    itself."""
 
     def blur_to_add(self, enlarged: float = 1.0) -> float:
         """Return the Gaussian that a rendered object lacks [px].
