@@ -2,16 +2,14 @@
 
     python -m benchmarks.look.toning --panoramas DIR [--crops 3] [--json FILE]
 
-A crop is a photograph of 640 x 427 pixels with a code of noise, in a JPEG file of a drawn quality.
+A crop is a photograph of 640 x 427 pixels with a code of noise, in a JPEG file.
 Toned, it is led through a drawn curve for each channel: sepia, duotone, cast or split tones. Those
 that show no detail or few tones are never taken for toned (`warpir.look.toning`).
 """
 
-import io
-
 import numpy as np
-from PIL import Image
 
+from benchmarks.look.composites import jpeg_of
 from benchmarks.measure import flags, write_json
 from benchmarks.scenes import codes_of, panoramas_of
 from warpir.core.arrays import AnyFloatArray, Float64Array
@@ -40,9 +38,7 @@ def toned(grey: AnyFloatArray, draw: np.random.Generator) -> Float64Array:
 
 def photo_of(shown: AnyFloatArray, quality: int) -> Photo:
     """Return display values as the photo in a JPEG file."""
-    file = io.BytesIO()
-    Image.fromarray(codes_of(shown)).save(file, "JPEG", quality=quality)
-    codes = np.asarray(Image.open(file))
+    codes, _ = jpeg_of(codes_of(shown), quality)
     return Photo(codes, codes.astype(np.float32) / np.float32(255.0), "jpeg")
 
 

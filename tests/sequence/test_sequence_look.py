@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from tests.builders.insertions import Run, arguments, go, record_of
 from tests.builders.outcome import outcome
+from tests.look.test_toning import TONES, a_scene
 from warpir.core.errors import ExitCode
 from warpir.insert import main
 
@@ -104,6 +105,23 @@ def test_frames_rendered_again_are_those_of_the_whole_run(
     assert main(argv) == ExitCode.DONE
     for name in ("0001", "0002", "0003", "0004"):
         assert outcome(out / name) == outcome(whole / name)
+
+
+def test_toned_frame_tones_all_of_its_size(inputs: Path, tmp_path: Path) -> None:
+    """Also a frame of few tones, which alone would be taken for one in colour."""
+    for name, scene in (("1.png", a_scene()), ("2.png", a_scene(0.4, 0.8))):
+        codes = np.round(255.0 * np.clip(TONES["sepia"](scene), 0.0, 1.0)).astype(np.uint8)
+        Image.fromarray(codes).save(tmp_path / name)
+    lines = [json.dumps({"photo": str(tmp_path / name)}) for name in ("1.png", "2.png")]
+    (tmp_path / "s.jsonl").write_text("\n".join(lines))
+    alone = {"photo": str(tmp_path / "2.png"), **FAST}
+    light = go(arguments(inputs, tmp_path / "alone", **alone), tmp_path / "alone")
+    assert "toning" not in light.record["measured"]["look"]
+    shared: dict[str, str | None] = {"light": None, "reuse": str(light.out), **FAST}
+    shared |= {"sequence": str(tmp_path / "s.jsonl")}
+    assert main(arguments(inputs, tmp_path / "out", **shared)) == ExitCode.DONE
+    first, second = (record_of(tmp_path / "out" / f"000{k}")["measured"]["look"] for k in (1, 2))
+    assert first["toning"] == second["toning"] and second["frame"] == "0001"
 
 
 def test_given_values_are_no_frames(
