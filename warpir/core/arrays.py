@@ -51,9 +51,15 @@ def mask_box(mask: BoolArray, margin: int = 0) -> tuple[slice, slice]:
 
 
 def on_cores(function: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
-    """Return what a function makes of each item, by as many threads as there are cores."""
+    """Return what a function makes of each item, by as many threads as there are cores.
+
+    One item is left to the caller's own thread: to start another takes longer than small work.
+    """
+    todo = list(items)
+    if len(todo) < 2:
+        return [function(item) for item in todo]
     with ThreadPoolExecutor(core_count()) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(function, todo))
 
 
 def in_bands(work: Callable[[slice], object], height: int, width: int) -> None:
