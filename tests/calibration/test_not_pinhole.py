@@ -16,7 +16,7 @@ from warpir.calibration.not_pinhole import (
     is_panorama,
     looks_like,
 )
-from warpir.core.arrays import FloatArray
+from warpir.core.arrays import BoolArray, FloatArray
 from warpir.train.networks.calibrator import CalibratorConfig, random_calibrator
 
 SMALL = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
@@ -34,6 +34,15 @@ def scene(seed: int, height: int = 240, width: int = 320) -> FloatArray:
     photo += 0.2 * np.sin(rng.uniform(2.0, 9.0) * u + rng.uniform(2.0, 9.0) * v)[..., None]
     photo += 0.02 * rng.normal(size=photo.shape)
     return photo.clip(0.0, 1.0).astype(np.float32)
+
+
+def ellipse(height: int, width: int, axes: tuple[float, float]) -> BoolArray:
+    """Return what lies in an ellipse of such semi-axes, across and high [px]; shape [H, W, 1]."""
+    v, u = np.ogrid[:height, :width]
+    across = (u + 0.5 - width / 2.0) / axes[0]
+    high = (v + 0.5 - height / 2.0) / axes[1]
+    inside: BoolArray = (np.hypot(across, high) < 1.0)[..., None]
+    return inside
 
 
 def side_by_side(gutter: int) -> FloatArray:
@@ -130,12 +139,27 @@ def test_pictures_of_any_size_have_an_answer(shape: tuple[int, int]) -> None:
     assert not has_seam(noise)
 
 
-def test_circle_in_even_corners_is_a_fisheye_picture() -> None:
-    v, u = np.ogrid[:240, :320]
-    inside = (np.hypot(v - 119.5, u - 159.5) < 120.0)[..., None]
-    circle = np.where(inside, scene(6), np.float32(0.0))
+@pytest.mark.parametrize("height, width", [(240, 320), (256, 512), (400, 533), (800, 600)])
+@pytest.mark.parametrize("corner", [0.0, 1.0])
+def test_circle_in_even_corners_is_a_fisheye_picture(
+    height: int, width: int, corner: float
+) -> None:
+    """Of any size: larger ones are looked at in steps, which may not squeeze the circle."""
+    inside = ellipse(height, width, (min(height, width) / 2, min(height, width) / 2))
+    photo = scene(6, height, width)
+    circle = np.where(inside, photo, np.float32(corner))
     assert has_image_circle(circle) and looks_like(circle) == "a circular fisheye picture"
-    assert not has_image_circle(scene(6))
+    assert not has_image_circle(photo)
+
+
+@pytest.mark.parametrize("height, width", [(240, 320), (400, 533), (800, 600)])
+@pytest.mark.parametrize("across, high", [(0.95, 0.5), (0.5, 0.95), (0.75, 0.7)])
+def test_object_before_an_even_backdrop_is_no_fisheye_picture(
+    height: int, width: int, across: float, high: float
+) -> None:
+    inside = ellipse(height, width, (across * width / 2, high * height / 2))
+    shot = np.where(inside, scene(6, height, width), np.float32(1.0))
+    assert not has_image_circle(shot)
 
 
 def test_estimate_of_a_collage_is_unsure_and_otherwise_as_before(

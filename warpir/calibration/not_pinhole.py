@@ -9,6 +9,8 @@ import numpy as np
 
 from warpir.core.arrays import BoolArray, FloatArray
 
+SECTORS, AROUND, LEAST_DIFFERENCE = 24, 0.75, 0.02
+"""Sectors of a fisheye's rim, the share of them that differ from its corners, and by how much."""
 LONGEST = 1024
 """Longer side that seams are looked for at [px]: larger pictures are averaged."""
 SHORTEST = 64
@@ -51,18 +53,30 @@ def looks_like(photo: FloatArray) -> str:
 def has_image_circle(photo: FloatArray) -> bool:
     """Tell whether a photo is a circle in corners of one colour, as a circular fisheye's.
 
+    What is within the circle differs from the corners all around, unlike an object that is shown
+    before a backdrop of one colour.
+
     Args:
         photo: Display-encoded in [0, 1], shape [H, W, 3].
     """
-    photo = photo[:: max(1, photo.shape[0] // 256), :: max(1, photo.shape[1] // 256)]
+    step = max(1, min(photo.shape[:2]) // 256)  # one for both axes: a circle stays one
+    photo = photo[::step, ::step]
     height, width = photo.shape[:2]
     v, u = np.ogrid[:height, :width]
-    radius = np.hypot(v + 0.5 - height / 2.0, u + 0.5 - width / 2.0) / (min(height, width) / 2.0)
-    outside, rim = photo[radius > 1.1], photo[(radius > 0.8) & (radius < 0.95)]
-    if not (len(outside) and len(rim)):
+    down, right = v + 0.5 - height / 2.0, u + 0.5 - width / 2.0
+    radius = np.hypot(down, right) / (min(height, width) / 2.0)
+    outside, is_rim = photo[radius > 1.1], (radius > 0.8) & (radius < 0.95)
+    if not (len(outside) and is_rim.any()):
         return False
     # JPEG leaves a code or two of noise in what was one colour.
-    return bool(outside.std(axis=0).max() < 0.01 and rim.std(axis=0).max() > 0.05)
+    if outside.std(axis=0).max() >= 0.01 or photo[is_rim].std(axis=0).max() <= 0.05:
+        return False
+    sector = ((np.arctan2(down, right)[is_rim] / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.intp)
+    differs = np.abs(photo[is_rim] - outside.mean(axis=0)).max(axis=1) > LEAST_DIFFERENCE
+    most = np.bincount(sector % SECTORS, differs, SECTORS) > 0.5 * np.bincount(
+        sector % SECTORS, minlength=SECTORS
+    )
+    return bool(most.mean() >= AROUND)
 
 
 def is_panorama(photo: FloatArray) -> bool:
