@@ -22,6 +22,7 @@ from warpir.render.integrator import Radiance
 from warpir.render.mis.integrator import MisIntegrator
 from warpir.render.renderer import Renderer
 from warpir.render.transport import cache as transport_cache
+from warpir.render.transport import matrix
 from warpir.render.transport import rows as transport_rows
 from warpir.render.transport.integrator import TransportIntegrator
 from warpir.render.transport.matrix import DenseRows, product
@@ -310,6 +311,25 @@ def test_transport_stores_small_numbers_well(device: str) -> None:
         error = (small / truth - 1.0).abs()
         assert float(error.max()) < 4.0 * BFLOAT16
         assert abs(float((small / truth - 1.0).mean())) < 0.1 * BFLOAT16
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("is_wide", [False, True])
+def test_products_on_any_cpu(monkeypatch: pytest.MonkeyPatch, channels: int, is_wide: bool) -> None:
+    """With AVX-512 in the small type, else in float32 piece by piece, which does not round more."""
+    monkeypatch.setattr(matrix, "_has_wide_registers", lambda: is_wide)
+    rng = np.random.default_rng(3)
+    count, across = 2 * matrix.PIECE // 900 + 7, 900
+    T = torch.tensor(rng.uniform(size=(channels, count, across)), dtype=torch.bfloat16)
+    x, d = (torch.tensor(rng.uniform(size=(n, 3)), dtype=torch.float32) for n in (across, count))
+    rows = DenseRows(T)
+    exact = T.double().expand(3, -1, -1)
+    for found, truth in (
+        (rows.times(x), torch.einsum("crk,kc->rc", exact, x.double())),
+        (rows.transposed_times(d), torch.einsum("crk,rc->kc", exact, d.double())),
+    ):
+        error = float((found / truth - 1.0).abs().max())
+        assert error < (4.0 * BFLOAT16 if is_wide else 1e-5)
 
 
 def test_transport_shadow_ratio_stays_within_its_bounds(device: str) -> None:

@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+PIECE = 1 << 18
+"""Entries of a matrix of small type that are converted to float32 at once, to stay in a cache."""
+
 
 class SparseRows:
     """A float32 matrix that is mostly zero, stored by rows and, for the transpose, by columns.
@@ -90,8 +93,8 @@ class DenseRows:
     def transposed_times(self, d: Tensor) -> Tensor:
         """Return the transposes' products with the columns of ``d``, shape [row, 3]."""
         if len(self.T) == 1:
-            return _multiply(self.T[0].t(), d)
-        columns = [_multiply(self.T[c].t(), d[:, c : c + 1]) for c in range(3)]
+            return _multiply(self.T[0], d, is_transposed=True)
+        columns = [_multiply(self.T[c], d[:, c : c + 1], is_transposed=True) for c in range(3)]
         return torch.cat(columns, dim=1)
 
 
@@ -117,15 +120,41 @@ def product(T: DenseRows | SparseRows, x: Tensor) -> Tensor:
     return out
 
 
-def _multiply(T: Tensor, x: Tensor) -> Tensor:
-    """Multiply a matrix of small type with float32 columns.
+def _multiply(T: Tensor, x: Tensor, is_transposed: bool = False) -> Tensor:
+    """Multiply a matrix of small type, or its transpose, with float32 columns.
 
     Two columns of the small type hold a float32 number to 16 bits, so that rounding the light does
     not scale a whole picture; reading ``T`` is what takes the time.
     """
-    if T.dtype == torch.float32:
+    is_small = T.dtype != torch.float32
+    if is_small and not (T.is_cuda or _has_wide_registers()):
+        return _multiply_by_pieces(T, x, is_transposed)
+    if is_transposed:
+        T = T.t()
+    if not is_small:
         return T @ x
     high = x.to(T.dtype)
     low = (x - high.to(x.dtype)).to(T.dtype)
     both = (T @ torch.cat([high, low], dim=1)).to(x.dtype)
     return both[:, : x.shape[1]] + both[:, x.shape[1] :]
+
+
+def _has_wide_registers() -> bool:
+    """Tell whether torch multiplies small types on this CPU as fast as memory is read."""
+    return "AVX512" in torch.backends.cpu.get_cpu_capability()
+
+
+def _multiply_by_pieces(T: Tensor, x: Tensor, is_transposed: bool) -> Tensor:
+    """As `_multiply`, in float32: without AVX-512 torch takes ten times as long in a small type."""
+    count = max(1, PIECE // max(1, T.shape[1]))
+    out = x.new_zeros(x.shape[1], T.shape[1] if is_transposed else T.shape[0])
+    for start in range(0, len(T), count):
+        rows = slice(start, start + count)
+        piece = T[rows].to(x.dtype)
+        # A column at a time, which is faster than products with two or three.
+        for column in range(x.shape[1]):
+            if is_transposed:
+                out[column].addmv_(piece.t(), x[rows, column])
+            else:
+                torch.mv(piece, x[:, column], out=out[column, rows])
+    return out.t()
