@@ -14,7 +14,6 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warpir.core import memory
-from warpir.evaluate.results import commit
 
 PATHS = {"type": Path, "nargs": "+", "required": True}
 FOLDER = Path("../shared/data")
@@ -62,6 +61,9 @@ def peak_mib(device: wp.Device) -> float:
 
 def context(device: wp.Device, threads: int) -> dict[str, Any]:
     """Return what a figure depends on besides the code."""
+    # Brings torch and the optimiser, whose memory a measured picture does not need.
+    from warpir.evaluate.results import commit
+
     return {
         "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
 from benchmarks.measure import context, flags, write_json
@@ -324,6 +325,7 @@ def main(arguments: list[str] | None = None) -> None:
         "drjit": dr.__version__,
         "variant": mi.variant(),
         "torch": version("torch"),
+        "instructions": torch.backends.cpu.get_cpu_capability() if device == "cpu" else None,
         "quick": options.quick,
         "size": [plan.width, plan.height],
         "command": "python -m benchmarks.speed " + " ".join(arguments or sys.argv[1:]),

@@ -121,7 +121,8 @@ def cost_text(runs: Sequence[dict[str, Any]]) -> str:
         "## What a picture costs",
         "A ball on the plane under a sun and a sky as one map, with bounce, as a run renders its "
         f"last picture at depth {DEPTH}: `python -m benchmarks.speed.cost`. The scene is built "
-        "once; memory is that of the process, of the card on CUDA.",
+        "once, and the first also compiles what a fresh machine lacks; memory is that of the "
+        "process, of the card on CUDA.",
         f"![Seconds of a picture]({PLOT.name})",
     ]
     for run in runs:

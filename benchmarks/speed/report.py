@@ -171,7 +171,7 @@ def device_text(result: dict[str, Any]) -> str:
     c = result["conditions"]
     resolution = {r["scene"]: r["rmse_resolution"] for r in result["rows"]}
     costs = ", ".join(f"{scene} {percent(e)}" for scene, e in resolution.items())
-    threads = f", {c['threads']} threads" if c["threads"] else ""
+    threads = f", {c['threads']} threads, {c['instructions']}" if c["threads"] else ""
     pixels = "; ".join(
         f"{s['name']}: {s['triangles']} triangles, D = {s['depth']}, {s['object_pixels']} object "
         f"pixels, {s['receiver_pixels']} of the plane"

@@ -70,6 +70,7 @@ def result(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "commit": "0000000",
             "warp": "1",
             "torch": "2",
+            "instructions": "AVX2",
             "mitsuba": "3",
             "variant": "llvm_ad_rgb",
             "size": [96, 64],
@@ -231,7 +232,7 @@ def test_documents_hold_every_device_that_was_kept(
     assert [p.name for p in paths] == ["test_cpu.json", "some_gpu_1.json"]
     report.write_documents(tmp_path)
     text = (tmp_path / "speed_against_error.md").read_text()
-    assert "## test CPU, 2 threads" in text and "## Some GPU 1" in text
+    assert "## test CPU, 2 threads, AVX2" in text and "## Some GPU 1" in text
     assert "400 x" in text and "ToyCar.glb is not in the folder" in text
     assert (tmp_path / "speed_against_error.png").stat().st_size < 300_000
 
