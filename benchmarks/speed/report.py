@@ -49,7 +49,9 @@ independent references free them of the references' noise. `image` joins foregro
 ratio, `gradient` the gradients of their weighted sums with respect to the texels, as
 `sqrt((e_fg^2 + e_ratio^2) / 2)`. 2 % of the pixels, those in which a pilot of `mis` is noisiest,
 are left out of `image`: a handful of mirrored suns holds 99 % of ToyCar's squared error in every
-renderer. The error with them is the column `all`.
+renderer. The error with them is the column `all`. Among the others are fireflies enough that in one
+to three runs chance decides ToyCar's forward ratio; `benchmarks.speed.fireflies` runs it over many
+seeds ([figures](figures.md)).
 
 Without a gradient `mis` samples otherwise: it picks a direction toward the light among eight, with
 what all would bring as its control variate, and on the CPU gives more samples to pixels where a
