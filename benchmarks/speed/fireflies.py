@@ -60,7 +60,7 @@ def main() -> None:
     device, threads = choose_device(options.device), core_count()
     use_device("cpu" if device == "cpu" else "cuda", threads)
     scene = make_scene(options.scene, 384, 256, options.assets, device, threads)
-    bench = Bench(scene, "ldsampler", freeze=True)
+    bench = Bench(scene, "ldsampler", freeze=device == "cpu")  # Dr.Jit refuses ToyCar on CUDA
     references = References(bench, options.cache, lambda text: print(text, flush=True))
     rows = []
     for make, samples in POINTS:

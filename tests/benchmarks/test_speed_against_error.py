@@ -6,13 +6,14 @@ import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.speed import __main__ as bench
-from benchmarks.speed import cost, report
+from benchmarks.speed import cost, fireflies, report
 from benchmarks.speed import ratios as r
 from benchmarks.speed.references import Reference, quiet
 from tests.builders.programs.llvm import LIBRARY, llvm
@@ -287,3 +288,16 @@ def test_a_quick_run_holds_what_it_promises(tmp_path: Path) -> None:
     assert record["mis"]["forward_image"]["ratio"] > 0.1
     best = min(row["rmse_gradient"] for row in made["rows"] if row["integrator"] == "mitsuba")
     assert best < 0.3
+
+
+def test_fireflies_are_counted_in_the_mean_square() -> None:
+    """One run in four with an error of 8 beside three of 1; the median does not see it."""
+    made = SimpleNamespace(integrator="mis", spp=4, warm=lambda: None)
+    made.forward = lambda seed: lambda: {"foreground": 8.0 if seed % 4 == 0 else 1.0}
+    reference = SimpleNamespace(own=[None, [None]], rmse=lambda values: {"image": values[0]})
+    references = SimpleNamespace(by_part={"foreground": reference})
+    row = fireflies.measured(made, references, 8)  # type: ignore[arg-type]
+    assert row["rmse"] == pytest.approx((67.0 / 4.0) ** 0.5) and row["median_rmse"] == 1.0
+    squares = np.array([64.0, 1.0, 1.0, 1.0] * 2)
+    error = squares.std(ddof=1) / 8.0**0.5 / (2.0 * float(row["rmse"]))
+    assert row["rmse_standard_error"] == pytest.approx(error)
