@@ -24,41 +24,36 @@ def keep_direction(record: LightRecord, i: int, j: int, wi: wp.vec3, weight: wp.
 
 
 @wp.kernel
-def radiance_gradient(d_pixel: wp.array[wp.mat33], record: LightRecord):
-    """Turn each weight into the loss gradient of the radiance from there; a thread a pixel.
-
-    Args:
-        d_pixel: What a weight is multiplied by, shape [pixel].
-        record: Directions and weights, rows are pixels; overwritten.
-    """
-    i = wp.tid()
-    d = d_pixel[i]
-    for j in range(record.count[i]):
-        record.weight[i, j] = d * record.weight[i, j]
-
-
-@wp.kernel
 def map_gradient(
+    d_pixel: wp.array[wp.mat33],
+    lanes: int,
     record: LightRecord,
     map_height: int,
     map_width: int,
-    d_texels: wp.array2d[wp.vec3],
+    d_texels: wp.array3d[wp.vec3],
 ):
-    """Add each entry's gradient to the four texels that its direction reads; a thread a pixel.
+    """Add each entry's gradient to the four texels that its direction reads; a thread a row.
+
+    Neighbouring threads add to different copies of the map: most of their directions may go to the
+    few texels of a sun, where one addition waits for the other.
 
     Args:
-        record: Directions, and what `radiance_gradient` left; rows are pixels.
+        d_pixel: Times a weight it is the loss gradient of the radiance from there, shape [pixel].
+        lanes: Rows of a pixel.
+        record: Directions and weights, rows are pixels or lanes of them.
         map_height: He.
         map_width: We.
-        d_texels: Output, shape [He, We].
+        d_texels: Output, to be added up over its copies, shape [copy, He, We].
     """
     i = wp.tid()
+    copy = i % d_texels.shape[0]
+    d = d_pixel[i // lanes]
     for j in range(record.count[i]):
-        d_L = record.weight[i, j]
+        d_L = d * record.weight[i, j]
         tap = bilinear_tap(direction_to_uv(record.wi[i, j]), map_height, map_width)
         top = d_L * (1.0 - tap.wi)
         bottom = d_L * tap.wi
-        wp.atomic_add(d_texels, tap.i0, tap.j0, top * (1.0 - tap.wj))
-        wp.atomic_add(d_texels, tap.i0, tap.j1, top * tap.wj)
-        wp.atomic_add(d_texels, tap.i1, tap.j0, bottom * (1.0 - tap.wj))
-        wp.atomic_add(d_texels, tap.i1, tap.j1, bottom * tap.wj)
+        wp.atomic_add(d_texels, copy, tap.i0, tap.j0, top * (1.0 - tap.wj))
+        wp.atomic_add(d_texels, copy, tap.i0, tap.j1, top * tap.wj)
+        wp.atomic_add(d_texels, copy, tap.i1, tap.j0, bottom * (1.0 - tap.wj))
+        wp.atomic_add(d_texels, copy, tap.i1, tap.j1, bottom * tap.wj)

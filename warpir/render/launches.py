@@ -7,7 +7,7 @@ memory is short.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -137,20 +137,24 @@ class ObjectLaunch:
         pixels: IntArray,
         may_see_object: IntArray,
         spp: int,
+        lanes: int,
         record: LightRecord | None = None,
     ) -> FloatArray:
-        """Return what the object throws onto the white receiver, a row a pixel."""
+        """Return what the object throws onto the white receiver, a row a pixel.
+
+        ``lanes`` are as in `sums`.
+        """
         out = renderer.zeros(len(pixels), wp.vec3)
-        self._trace(renderer, pixels, may_see_object, spp, 1, [out], record, None)
+        self._trace(renderer, pixels, may_see_object, spp, lanes, [out], record, None)
         radiance: FloatArray = out.numpy()[: len(pixels)]
         return radiance
 
     def mirrored(
-        self, renderer: Renderer, pixels: IntArray, may_see_object: IntArray, spp: int
+        self, renderer: Renderer, pixels: IntArray, may_see_object: IntArray, spp: int, lanes: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the object's image in the ground's coat, what it hides there, and what not."""
         out = [renderer.zeros(len(pixels), wp.vec3) for _ in range(3)]
-        self._trace(renderer, pixels, may_see_object, spp, 1, out, None, None)
+        self._trace(renderer, pixels, may_see_object, spp, lanes, out, None, None)
         image, hidden, kept = (a.numpy()[: len(pixels)] for a in out)
         return image, hidden, kept
 
@@ -220,6 +224,21 @@ three fifths of the time and holds a seventh of the squared error. Not in blocks
 noise would bend what is interpolated."""
 
 
+class ReceiverRows(NamedTuple):
+    """Pixels of the receiver, a row each."""
+
+    pixels: IntArray
+    """Row-major indices."""
+    may_see_object: IntArray
+    """1 where the object may hide the receiver."""
+    may_gain: BoolArray
+    """False where the object throws nothing."""
+
+    def at(self, rows: IntArray | BoolArray) -> ReceiverRows:
+        """Return some of the rows."""
+        return ReceiverRows(self.pixels[rows], self.may_see_object[rows], self.may_gain[rows])
+
+
 @dataclass(frozen=True)
 class ReceiverLaunch:
     """Arguments of a launch over the white receiver that all pixels share."""
@@ -242,20 +261,21 @@ class ReceiverLaunch:
     def sums(
         self,
         renderer: Renderer,
-        pixels: IntArray,
-        may_see_object: IntArray,
-        may_gain: BoolArray,
+        seen: ReceiverRows,
         spp: int,
+        lanes: int,
         record: LightRecord | None = None,
         thrown_record: LightRecord | None = None,
     ) -> tuple[FloatArray, ...]:
         """Return the radiance with and without the object and what it throws there, a row a pixel.
 
-        Where ``may_gain`` is False the object throws nothing. The first includes the last.
+        The first includes the last. ``lanes`` threads share a pixel's samples; each has a row of
+        the records.
         """
+        pixels, may_see_object, may_gain = seen
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
-        seen = [
+        scene = [
             Rows(uploaded(renderer, pixels, self.camera_args)),
             Rows(renderer.upload(may_see_object, wp.int32)),
             self.camera_args,
@@ -263,22 +283,14 @@ class ReceiverLaunch:
             self.light,
         ]
         rows, work = map(Rows, out), spp * self.rays
+        shared = [spp // lanes, self.rays, lanes, self.seed, *rows]
         if self.plane_radiance is not None:
-            lanes = renderer.lanes(count, spp)
-            args = [
-                *seen,
-                wp.vec3(*map(float, self.plane_radiance)),
-                spp // lanes,
-                self.rays,
-                lanes,
-            ]
-            args += [self.seed, *rows]
+            args = [*scene, wp.vec3(*map(float, self.plane_radiance)), *shared]
             kernel = plane_shadow_kernel(renderer.scene.has_passing)
-            renderer.launch(kernel, count, args, work, "shadow", lanes)
         else:
-            kept = LightRecord() if record is None else Rows(record)
-            args = [*seen, spp, self.rays, self.seed, *rows, kept]
-            renderer.launch(trace_receiver, count, args, work, "shadow")
+            args = [*scene, *shared, LightRecord() if record is None else Rows(record)]
+            kernel = trace_receiver
+        renderer.launch(kernel, count, args, work, "shadow", lanes)
         lit, unoccluded = (a.numpy()[:count] for a in out)
         if renderer.scene.lamps:
             near = self.by_lamps(renderer, pixels, may_see_object, spp)
@@ -287,8 +299,9 @@ class ReceiverLaunch:
         if self.bounce_depth and may_gain.any():
             launch = self.thrown(renderer)
             few = spp if self.is_recorded else max(1, spp // THROWN_SHARE)
+            lanes = lanes if self.is_recorded else renderer.lanes(int(may_gain.sum()), few)
             thrown[may_gain] = launch.thrown(
-                renderer, pixels[may_gain], may_see_object[may_gain], few, thrown_record
+                renderer, pixels[may_gain], may_see_object[may_gain], few, lanes, thrown_record
             )
         return lit + thrown, unoccluded, thrown
 

@@ -29,6 +29,7 @@ from warpir.render.launches import (
     THROWN_LIMIT,
     ObjectLaunch,
     ReceiverLaunch,
+    ReceiverRows,
     geometry_of,
     variant_of,
 )
@@ -262,9 +263,8 @@ class Renderer(Launcher):
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
                 # As many lanes as all rows have together: sums keep their order.
-                cut = (
-                    r if r is None else Rows(r).cut(start * lanes, stop * lanes) for r in records
-                )
+                first, last = start * lanes, stop * lanes
+                cut = (r if r is None else Rows(r).cut(first, last) for r in records)
                 return own.sums(self, pixels[rows[start:stop]], spp, lanes, *cut)
 
             return self._in_chunks(trace, len(rows), "object")
@@ -316,7 +316,7 @@ class Renderer(Launcher):
             rays: Directions per technique and camera sample.
             seed: Base seed.
             camera_args: Another resolution of the view, or the scene's own.
-            record: Filled on the way where given; rows are ``pixels``.
+            record: Filled on the way where given; rows are ``pixels``, `lanes` of each.
             thrown_record: The same of the light that the object throws there, RGB weights of `lit`.
             indirect_limit: Of `foreground`; what is thrown has `THROWN_LIMIT` of it. 0: no limit.
             may_gain: False where the object throws nothing (`warpir.render.shadow.pilot`), shape
@@ -344,32 +344,31 @@ class Renderer(Launcher):
         )
         gain = np.ones(len(pixels), np.bool_) if may_gain is None else may_gain
         assert thrown_record is None or gain.all(), "rows of the record are pixels"
-        rows, records = (pixels, may_see_object, gain), (record, thrown_record)
+        rows, records = ReceiverRows(pixels, may_see_object, gain), (record, thrown_record)
         return self._white_radiance(launch, rows, spp, records, camera_args, sharing)
 
     def _white_radiance(
         self,
         launch: ReceiverLaunch,
-        rows: tuple[IntArray, IntArray, BoolArray],
+        rows: ReceiverRows,
         spp: int,
         records: tuple[LightRecord | None, LightRecord | None],
         camera_args: CameraArgs | None,
         sharing: Sharing | None,
     ) -> ReceiverRadiance:
-        """Trace what `receiver` has set up; ``rows`` are its pixels, and what they see and gain."""
-        pixels, may_see_object, gain = rows
-
+        """Trace what `receiver` has set up."""
         stage, width = "shadow", self.scene.camera.width
         if camera_args is not None:
             stage, width = "shadow in another resolution", int(camera_args.width)
 
         def rows_of(chosen: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
             own = replace(launch, seed=pilot_seed(launch.seed, number))
+            lanes = self.lanes(len(chosen), spp)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
-                part = chosen[start:stop]
-                cut = (r if r is None else Rows(r).cut(start, stop) for r in records)
-                return own.sums(self, pixels[part], may_see_object[part], gain[part], spp, *cut)
+                first, last = start * lanes, stop * lanes
+                cut = (r if r is None else Rows(r).cut(first, last) for r in records)
+                return own.sums(self, rows.at(chosen[start:stop]), spp, lanes, *cut)
 
             traced = self._in_chunks(trace, len(chosen), stage)
             if number:
@@ -378,17 +377,16 @@ class Renderer(Launcher):
             return traced
 
         def first_bad_sample(pixel: int) -> int | None:
-            alone = np.array([pixel], np.int32)
-            hidden, gains = may_see_object[pixels == pixel], gain[pixels == pixel]
+            alone = rows.at(rows.pixels == pixel)
             return first_bad_sample_of(
-                lambda spp: not all_finite(launch.sums(self, alone, hidden, gains, spp)), spp
+                lambda spp: not all_finite(launch.sums(self, alone, spp, 1)), spp
             )
 
         traced, self.mean_samples[stage] = by_noise(
-            self, rows_of, sharing, pixels, width, (spp, launch.rays)
+            self, rows_of, sharing, rows.pixels, width, (spp, launch.rays)
         )
         # Black with and without the object: there the photo stays as it is.
-        traced = self.bad_pixels.blackened(traced, pixels, width, stage, first_bad_sample)
+        traced = self.bad_pixels.blackened(traced, rows.pixels, width, stage, first_bad_sample)
         return ReceiverRadiance(*traced)
 
     def thrown(
@@ -410,10 +408,11 @@ class Renderer(Launcher):
         launch = ReceiverLaunch(
             from_light, from_light, None, camera_args, rays, seed, depth, indirect_limit
         ).thrown(self)
+        lanes = self.lanes(len(pixels), spp)
 
         def trace(start: int, stop: int) -> tuple[FloatArray]:
             nothing = np.zeros(stop - start, np.int32)
-            return (launch.thrown(self, pixels[start:stop], nothing, spp),)
+            return (launch.thrown(self, pixels[start:stop], nothing, spp, lanes),)
 
         return self._in_chunks(trace, len(pixels), "bounce in blocks")[0]
 
@@ -463,9 +462,11 @@ class Renderer(Launcher):
             behind,
         )
 
+        lanes = self.lanes(len(pixels), spp)
+
         def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
             part = slice(start, stop)
-            return launch.mirrored(self, pixels[part], may_see_object[part], spp)
+            return launch.mirrored(self, pixels[part], may_see_object[part], spp, lanes)
 
         traced = self._in_chunks(trace, len(pixels), "mirror image")
         image, hidden, kept = self.bad_pixels.blackened(

@@ -133,12 +133,13 @@ class ObjectSamples:
             light, vertex = self.kept or self.draw(rows)[1:]
             # Records serve one backward pass, so that two steps' never live side by side.
             self.kept = None
-            lanes = self.mis.renderer.lanes(len(d_radiance[rows]), self.mis.spp)
-            d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
             if light is not None:
-                part = map_gradient(self.mis.renderer, self.args, light, _per_channel(d_rows))
+                d_pixel = _per_channel(d_radiance[rows])
+                part = map_gradient(self.mis.renderer, self.args, light, d_pixel)
                 total[:1] = _add(total[:1], [part])
             if vertex is not None:
+                lanes = self.mis.renderer.lanes(len(d_radiance[rows]), self.mis.spp)
+                d_rows = np.repeat(d_radiance[rows], lanes, axis=0)
                 total[1:] = _add(
                     total[1:], self.material_gradient(vertex, d_rows, self.path_count // lanes)
                 )
@@ -255,8 +256,10 @@ class ReceiverSamples:
         """
         mis = self.mis
         pixels = mis.receiver_pixels[rows]
+        lanes, device = mis.renderer.lanes(len(pixels), mis.spp), mis.renderer.device
+        count = len(pixels) * lanes
         record, thrown = (
-            new_light_record(len(pixels), n, mis.renderer.device) if is_recording and n else None
+            new_light_record(count, n // lanes, device) if is_recording and n else None
             for n in (self.entries, self.thrown_entries)
         )
         out = mis.renderer.receiver(
@@ -298,42 +301,43 @@ def map_gradient(
     Args:
         renderer: Renderer, whose device and threads are used.
         args: The light.
-        record: Directions and weights, rows are pixels; used up.
+        record: Directions and weights, rows are pixels or lanes of them.
         d_pixel: Times a weight it is the loss gradient of the radiance from there, shape
             [pixel, 3, 3].
     """
     device = renderer.device
-    pixels, capacity = record.wi.shape
-    d_array = wp.array(d_pixel, dtype=wp.mat33, device=device)
-    renderer.launch(
-        light_kernels.radiance_gradient, pixels, [Rows(d_array), Rows(record)], capacity, "light"
-    )
+    rows, capacity = record.wi.shape
+    lanes = max(rows // max(len(d_pixel), 1), 1)
+    d_array = Rows(wp.array(d_pixel, dtype=wp.mat33, device=device))
     height, width = args.map_height, args.map_width
-    # A private map pays where more is added into it than there is to add up of it.
-    parts = max(1, min(PART_COUNT, pixels * capacity // (height * width)))
-    parts = parts if device.is_cpu else 1
-    texels = wp.zeros((parts, height, width), dtype=wp.vec3, device=device)
+    # A copy of the map pays where more is added into it than there is to add up of it.
+    copies = max(1, min(PART_COUNT, rows * capacity // (height * width)))
+    texels = wp.zeros((copies, height, width), dtype=wp.vec3, device=device)
+    # On the CPU each part of the rows has a copy of its own, else neighbours have.
+    parts = copies if device.is_cpu else 1
 
     def one(part: int) -> None:
-        start, stop = pixels * part // parts, pixels * (part + 1) // parts
+        start, stop = rows * part // parts, rows * (part + 1) // parts
+        own, kept = d_array.cut(start // lanes, stop // lanes), Rows(record).cut(start, stop)
         wp.launch(
             light_kernels.map_gradient,
             dim=stop - start,
-            inputs=[Rows(record).cut(start, stop), height, width],
-            outputs=[texels[part]],
+            inputs=[own, lanes, kept, height, width],
+            outputs=[texels if parts == 1 else texels[part : part + 1]],
             device=device,
             record_tape=False,
         )
 
     wp.load_module(light_kernels, device=device)
-    renderer.in_threads(one, range(parts if pixels else 0), "light")
+    renderer.in_threads(one, range(parts if rows else 0), "light")
     total: Float64Array = texels.numpy().sum(axis=0, dtype=np.float64)
     return total
 
 
 def _per_channel(d_pixel: FloatArray) -> FloatArray:
     """Return what takes RGB weights to a gradient per channel, shape [pixel, 3, 3]."""
-    diagonal: FloatArray = d_pixel[:, :, None] * np.eye(3, dtype=np.float32)
+    diagonal = np.zeros((len(d_pixel), 3, 3), np.float32)
+    np.einsum("nii->ni", diagonal)[:] = d_pixel
     return diagonal
 
 

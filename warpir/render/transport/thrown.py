@@ -59,7 +59,7 @@ def thrown_rows(
     def trace(start: int, stop: int) -> tuple[wp.array, FloatArray]:
         record = new_light_record(stop - start, capacity, renderer.device)
         emitted = launch.thrown(
-            renderer, pixels[start:stop], may_see_object[start:stop], spp, record
+            renderer, pixels[start:stop], may_see_object[start:stop], spp, 1, record
         )
         return spread_rows(renderer, record, height), emitted
 
