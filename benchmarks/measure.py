@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from warpir.app.record import commit
 from warpir.core import memory
 
 PATHS = {"type": Path, "nargs": "+", "required": True}
@@ -61,9 +62,6 @@ def peak_mib(device: wp.Device) -> float:
 
 def context(device: wp.Device, threads: int) -> dict[str, Any]:
     """Return what a figure depends on besides the code."""
-    # Brings torch and the optimiser, whose memory a measured picture does not need.
-    from warpir.evaluate.results import commit
-
     return {
         "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),

@@ -37,7 +37,7 @@ from benchmarks.speed.candidates import (
     use_device,
 )
 from benchmarks.speed.ratios import combined, ratios
-from benchmarks.speed.references import References
+from benchmarks.speed.references import REFERENCE_SPP, References
 from benchmarks.speed.report import keep_run, summary, write_documents
 from benchmarks.speed.scenes import NAMES, SpeedScene, make_scene
 from warpir.core.memory import core_count
@@ -71,9 +71,17 @@ class Plan:
     """Rounds in which transport is traced again."""
     budget_s: float = 10.0
     """A candidate that would take longer than this in all is not run again."""
+    reference_spp: tuple[int, int] = REFERENCE_SPP
+    """Of `References`; half of Mitsuba's is its largest here, so that nothing else is compiled."""
 
 
-QUICK = Plan(96, 64, (4, 16, 64), (4, 64, 1024), ({},), transport_rounds=1, budget_s=2.0)
+QUICK = Plan(
+    *(96, 64, (4, 16, 64), (16, 256), ({},)),
+    rounds=2,
+    transport_rounds=1,
+    budget_s=2.0,
+    reference_spp=(256, 512),
+)
 WARM_TRANSPORT = {"subsamples": 1, "bright_directions": 0, "paths": 1}
 
 
@@ -279,7 +287,7 @@ def measured(
     import drjit as dr
 
     bench = Bench(scene, options.sampler, not options.no_freeze)
-    references = References(bench, options.cache, log)
+    references = References(bench, options.cache, plan.reference_spp, log)
     rows = measure_scene(bench, plan, references)
     agreement = [
         {"scene": scene.name, "part": part, **reference.agreement()}
@@ -304,6 +312,8 @@ def main(arguments: list[str] | None = None) -> None:
     import drjit as dr
     import mitsuba as mi
 
+    # Modules stay; to look through them took half a second at each mark of the memory.
+    gc.freeze()
     rows: list[dict[str, Any]] = []
     agreement: list[dict[str, Any]] = []
     scenes: list[dict[str, Any]] = []

@@ -8,13 +8,14 @@ is too small where the rarest fireflies were not met.
 """
 
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.measure import context, flags, write_json
 from benchmarks.speed.candidates import Bench, MisPart, MitsubaPart, use_device
-from benchmarks.speed.references import References
+from benchmarks.speed.references import REFERENCE_SPP, References
 from benchmarks.speed.scenes import NAMES, make_scene
 from warpir.core.memory import core_count
 from warpir.render.device import choose_device
@@ -61,7 +62,7 @@ def main() -> None:
     use_device("cpu" if device == "cpu" else "cuda", threads)
     scene = make_scene(options.scene, 384, 256, options.assets, device, threads)
     bench = Bench(scene, "ldsampler", freeze=device == "cpu")  # Dr.Jit refuses ToyCar on CUDA
-    references = References(bench, options.cache, lambda text: print(text, flush=True))
+    references = References(bench, options.cache, REFERENCE_SPP, partial(print, flush=True))
     rows = []
     for make, samples in POINTS:
         runs = options.runs if samples < 256 else max(2, options.runs // 4)

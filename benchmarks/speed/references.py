@@ -29,8 +29,8 @@ with them is stated beside."""
 PILOT_RUNS, PILOT_SPP = 32, 16
 """Runs that tell which pixels these are. The references' own halves may not: where they happen to
 agree, their products are no longer free of noise."""
-OWN_SPP, MITSUBA_SPP = 512, 2048
-"""Camera samples per pixel; Mitsuba's are twice a power of 4."""
+REFERENCE_SPP = 512, 2048
+"""Camera samples per pixel, ours and Mitsuba's, which are twice a power of 4."""
 SEED = 10_000
 CHUNK = 64
 """Samples per pixel of one run of `mis`."""
@@ -91,17 +91,24 @@ class Reference:
 class References:
     """Makes references of one scene, or reads them from the folder of the cache.
 
-    ``log`` is told what was made.
+    Args:
+        bench: The scene.
+        cache: The folder.
+        spp: Such as `REFERENCE_SPP`.
+        log: Is told what was made.
     """
 
-    def __init__(self, bench: Bench, cache: Path, log: Callable[[str], None]) -> None:
-        self.bench, self.cache, self.log = bench, cache, log
+    def __init__(
+        self, bench: Bench, cache: Path, spp: tuple[int, int], log: Callable[[str], None]
+    ) -> None:
+        self.bench, self.cache, self.spp, self.log = bench, cache, spp, log
         self.by_part = {part: self._converge(part) for part in PARTS}
 
     def _converge(self, part: str) -> Reference:
         kept, pixels = self._quiet(part), len(self.bench.weights[part])
         made = []
-        for name, make, spp in (("own", _own, OWN_SPP), ("mitsuba", _mitsuba, MITSUBA_SPP)):
+        renderers = ("own", _own), ("mitsuba", _mitsuba)
+        for (name, make), spp in zip(renderers, self.spp, strict=True):
             flat = self._cached(
                 f"{name}, {part}, {spp} samples",
                 {"renderer": name, "part": part, "spp": spp, "map": self._hash(part)},
@@ -127,11 +134,12 @@ class References:
         """Relative RMSE between the image under the map and under the lobes it was made of."""
         found = []
         for part, reference in self.by_part.items():
-            key = {"renderer": "own", "part": part, "spp": OWN_SPP}
+            spp = self.spp[0]
+            key = {"renderer": "own", "part": part, "spp": spp}
             exact = self._cached(
-                f"own, {part}, lobes, {OWN_SPP} samples",
+                f"own, {part}, lobes, {spp} samples",
                 {**key, "map": self._hash(part, of_lobes=True)},
-                lambda part=part: _own_lobes(self.bench, part, OWN_SPP),
+                lambda part=part, spp=spp: _own_lobes(self.bench, part, spp),
             ).reshape(2, -1, 3)
             images = (k[0].mean(axis=0) for k in (reference.own, reference.mitsuba))
             own, other, *lobes = (image[reference.kept] for image in (*images, *exact))

@@ -4,6 +4,8 @@ import hashlib
 import importlib.util
 import os
 import platform
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -133,6 +135,20 @@ def sources_hash() -> str:
     for name, file in sorted(files.items()):
         digest.update(f"{name}\0".encode() + file.read_bytes())
     return digest.hexdigest()
+
+
+def commit() -> str:
+    """Return the commit of this checkout; "unknown" for an installed package, or without git."""
+    root = Path(warpir.__file__).parents[1]
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return "unknown"  # git would name that of a repository around the installed package
+    git = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return git.stdout.strip() or "unknown"
 
 
 def versions() -> dict[str, str]:

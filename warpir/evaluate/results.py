@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import shutil
-import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 import warpir
-from warpir.app.record import versions
+from warpir.app.record import commit, versions
 from warpir.core.arrays import CodeArray
 from warpir.evaluate import report
 from warpir.evaluate.report import Entry
@@ -104,20 +101,6 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value if isinstance(value, bool | int | float | str | None) else str(value)
-
-
-def commit() -> str:
-    """Return the commit of this checkout; "unknown" for an installed package, or without git."""
-    root = Path(warpir.__file__).parents[1]
-    if not (root / ".git").exists() or shutil.which("git") is None:
-        return "unknown"  # git would name that of a repository around the installed package
-    git = subprocess.run(
-        ["git", "-C", str(root), "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return git.stdout.strip() or "unknown"
 
 
 def head_lines(record: dict[str, Any]) -> list[str]:

@@ -131,17 +131,18 @@ def sheen_table() -> NDArray[np.float32]:
     cosine = np.maximum(np.linspace(0.0, 1.0, SHEEN_COLUMNS) ** 2, 1e-5)
     steps = (np.arange(200) + 0.5) / 200.0
     cos_i, phi = (steps**3)[:, None], (np.pi * steps**2)[None, :]
-    area = 2.0 * (3.0 * steps**2)[:, None] * (2.0 * np.pi * steps)[None, :] / 200.0**2
+    d_cos, d_phi = 2.0 * 3.0 * steps**2 / 200.0, 2.0 * np.pi * steps / 200.0
+    alphas = [max(r**2, MIN_ALPHA) for r in np.linspace(0.0, 1.0, SHEEN_ROWS)]
+    shades = [1.0 + fibre_lambda(cos_i[:, 0], alpha) for alpha in alphas]
     table = np.zeros((SHEEN_ROWS, SHEEN_COLUMNS))
-    for row, roughness in enumerate(np.linspace(0.0, 1.0, SHEEN_ROWS)):
-        alpha = max(roughness**2, MIN_ALPHA)
-        shade = 1.0 + fibre_lambda(cos_i, alpha)
-        for column, cos_o in enumerate(cosine):
-            dot = cos_o * cos_i - np.sqrt((1.0 - cos_o**2) * (1.0 - cos_i**2)) * np.cos(phi)
-            sin2 = np.clip(1.0 - (cos_o + cos_i) ** 2 / (2.0 + 2.0 * dot), 0.0, 1.0)
-            D = (2.0 + 1.0 / alpha) * sin2 ** (0.5 / alpha) / (2.0 * np.pi)
+    for column, cos_o in enumerate(cosine):
+        dot = cos_o * cos_i - np.sqrt((1.0 - cos_o**2) * (1.0 - cos_i**2)) * np.cos(phi)
+        sin2 = np.clip(1.0 - (cos_o + cos_i) ** 2 / (2.0 + 2.0 * dot), 1e-300, 1.0)
+        log_sin2 = np.log(sin2)  # once for all powers of it
+        for row, (alpha, shade) in enumerate(zip(alphas, shades, strict=True)):
+            D = (2.0 + 1.0 / alpha) * np.exp(log_sin2 * (0.5 / alpha)) / (2.0 * np.pi)
             masked = shade + fibre_lambda(np.array(cos_o), alpha)
-            table[row, column] = np.sum(D / (4.0 * cos_o * masked) * area)
+            table[row, column] = (D @ d_phi) @ (d_cos / masked) / (4.0 * cos_o)
     return np.minimum(table, 1.0).astype(np.float32)
 
 
