@@ -6,6 +6,8 @@ A test covers the cases that its id names (``test_faults[I4-huge-header]``) or i
     python -m pytest --cases=cases.json
     python -m tests.cases cases.json            # writes the page
     python -m tests.cases cases.json --check    # says whether the page is what it would write
+
+The tests may run in parts, with a file each.
 """
 
 import csv
@@ -14,6 +16,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +59,21 @@ What warpir promises:
 """
 
 
+@cache
 def read_cases() -> dict[str, tuple[str, str]]:
     """Return what each case is and what it must end in, by its number."""
     with Path(__file__).with_suffix(".tsv").open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t", quoting=csv.QUOTE_NONE)
         return {row["number"]: (row["case"], row["expected"]) for row in rows}
+
+
+def cases_of(item: pytest.Item) -> list[str]:
+    """Return the numbers of the cases that a test covers."""
+    ids = item.name.partition("[")[2].rstrip("]").split("-")
+    marks = [str(n) for mark in item.iter_markers("case") for n in mark.args]
+    unknown = set(marks) - set(read_cases())
+    assert not unknown, f"{item.nodeid}: no such case: {unknown}"
+    return sorted({*marks} | ({*ids} & set(read_cases())))
 
 
 class CaseReport:
@@ -74,18 +87,12 @@ class CaseReport:
     def __init__(self, path: Path, is_worker: bool) -> None:
         self.path, self.is_worker = path, is_worker
         self.costs = [0.0, 0.0]
-        self.known = read_cases()
         self.found: dict[str, dict[str, str]] = {}
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         """Look up the cases of each test; its reports carry them."""
         for item in items:
-            ids = item.name.partition("[")[2].rstrip("]").split("-")
-            marks = [str(n) for mark in item.iter_markers("case") for n in mark.args]
-            unknown = set(marks) - set(self.known)
-            assert not unknown, f"{item.nodeid}: no such case: {unknown}"
-            covered = sorted({*marks} | ({*ids} & set(self.known)))
-            item.user_properties.append(("cases", covered))
+            item.user_properties.append(("cases", cases_of(item)))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
@@ -227,8 +234,14 @@ def _without_counts(page: str) -> list[str]:
 
 def main() -> int:
     """Write the page, or compare it with what would be written."""
-    found = json.loads(Path(sys.argv[1]).read_text())
-    seconds, peak = found.pop("costs", [0.0, 0])
+    found: dict[str, dict[str, str]] = {}
+    seconds = peak = 0.0
+    for path in sys.argv[1:]:
+        if path != "--check":
+            part = json.loads(Path(path).read_text())
+            seconds, peak = map(max, (seconds, peak), part.pop("costs", [0.0, 0]))
+            for number, outcomes in part.items():
+                found.setdefault(number, {}).update(outcomes)
     print(f"refused inputs took at most {seconds:.1f} s and {peak / 1e6:.0f} MB")
     page = page_of(found)
     if "--check" not in sys.argv[2:]:

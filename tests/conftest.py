@@ -14,6 +14,7 @@ import warp as wp
 from tests.builders.guided_runs import write_guided_inputs
 from tests.builders.insertions import write_inputs
 from tests.cases import CaseReport
+from tests.slow import SlowTests
 from warpir.render.device import start_warp
 
 # A shell's background job ignores Ctrl-C, and so would every program that the tests start.
@@ -25,12 +26,17 @@ start_warp()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--cases``, from which docs/robustness.md is made."""
+    """Add ``--cases``, from which docs/robustness.md is made, and ``--slow-until``."""
     parser.addoption("--cases", type=Path, help="write the outcomes of the numbered cases here")
+    about = "when the last slow test without a number may start [s since 1970]"
+    parser.addoption("--slow-until", type=float, help=about)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Note the outcomes of the numbered cases where that is asked for."""
+    """Note the outcomes of the numbered cases, and keep to a time, where that is asked for."""
+    until = config.getoption("--slow-until")
+    if until is not None:
+        config.pluginmanager.register(SlowTests(until))
     path = config.getoption("--cases")
     if path is not None:
         config.pluginmanager.register(CaseReport(path, hasattr(config, "workerinput")))

@@ -246,6 +246,7 @@ def module(request: pytest.FixtureRequest) -> ModuleType:
     return request.param
 
 
+@pytest.mark.slow
 @pytest.mark.case("R13")
 def test_every_kernel_that_adds_in_common_places_can_be_ordered(
     module: ModuleType, tmp_path: Path
@@ -261,6 +262,7 @@ def test_every_kernel_that_adds_in_common_places_can_be_ordered(
         wp.set_module_options(before, module)
 
 
+@pytest.mark.slow
 def test_only_additions_in_loops_need_room_to_spare(module: ModuleType, tmp_path: Path) -> None:
     """Warp counts those outside of loops itself; more room than they need is some gigabytes."""
     _order_kernels(is_deterministic=True)

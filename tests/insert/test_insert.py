@@ -486,6 +486,7 @@ def test_more_samples_where_their_noise_would_be_seen(
         assert f"--samples {of_remedy}" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device: str) -> None:
     """With what stays in front of the object; the result has the photo's size. A card has none."""
     large = {"photo": tmp_path / "photo.png", "mask": tmp_path / "mask.png"}

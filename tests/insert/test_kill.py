@@ -241,6 +241,7 @@ def whole_result(files: dict[str, str]) -> str:
     return who
 
 
+@pytest.mark.slow
 @pytest.mark.case("R1", "R4")
 @pytest.mark.parametrize("how", ["kill", "full", "broken"])
 @pytest.mark.parametrize("case", ["results", "again"])
@@ -270,6 +271,7 @@ def test_results_are_the_old_or_the_new_ones(tmp_path: Path, case: str, how: str
             assert turn["status"] in ((5, 0) if who == "new" else (5,)), turn
 
 
+@pytest.mark.slow
 @pytest.mark.case("R1", "R4")
 @pytest.mark.parametrize("how", ["kill", "full", "broken"])
 def test_a_whole_checkpoint_is_always_there(tmp_path: Path, how: str) -> None:

@@ -49,6 +49,7 @@ def test_known_blur_is_found(sigma: float, noise: float) -> None:
     assert found.sigma == pytest.approx(np.hypot(sigma, PIXEL_SIGMA), abs=0.12)
 
 
+@pytest.mark.slow
 def test_blur_beyond_the_derivatives_is_found() -> None:
     """Twice as blurred is told as more blurred, up to where nothing of the boxes is left."""
     found = [estimate_blur(boxes(sigma, height=320, width=480)) for sigma in (3.0, 4.5, 6.0)]

@@ -91,6 +91,7 @@ def test_damaged_package_is_told_in_a_line(other_weights: Path, content: bytes |
     assert raised.value.code == ExitCode.MODEL
 
 
+@pytest.mark.slow
 def test_written_weights_are_those_that_were_trained(
     other_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

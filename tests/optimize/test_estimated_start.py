@@ -71,6 +71,7 @@ def judged_as(monkeypatch: pytest.MonkeyPatch, is_accepted: bool) -> None:
     monkeypatch.setattr(recover, "judge", lambda *_: verdict)
 
 
+@pytest.mark.slow
 def test_default_run_is_the_estimated_light(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,6 +108,7 @@ def test_preview_is_the_result_in_small(folder: Path, tmp_path: Path) -> None:
     assert 0.0 < off < 0.5 * change
 
 
+@pytest.mark.slow
 def test_guided_run_says_where_it_began(
     folder: Path,
     tmp_path: Path,

@@ -74,6 +74,7 @@ class Target(Pull):
         return image - self.d_image
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["transport", "mis"])
 def test_powers_of_lamps_are_found(integrator: str, device: str) -> None:
     """One lamp is twice, one half as bright as said; all else is known and free to move."""

@@ -143,6 +143,7 @@ def test_plate_that_the_model_cannot_see_is_said(unit: float, words: str) -> Non
     assert not list(unseen_plate(Photo(dark, dark / np.float32(255.0), "png")))
 
 
+@pytest.mark.slow
 def test_guided_run_again_reuses_the_lora_and_gives_the_same_bytes(
     folder: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,6 +211,7 @@ def test_resume_names_what_changed(
     assert "Traceback" not in error and digest(unfinished) == before
 
 
+@pytest.mark.slow
 def test_resume_follows_the_advice_to_raise_the_precision(folder: Path, unfinished: Path) -> None:
     """What a run that overflowed is told to try is no other run."""
     again = [*argv(folder, unfinished), "--resume", "--precision", "fp32"]
@@ -387,6 +389,7 @@ def test_ablations(folder: Path, tmp_path: Path) -> None:
     assert not (out / "lora_kohya.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_start_from_a_given_light_preview_and_prior(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     changes = {"light": str(folder / "sky.hdr"), "start": None, "preview_every": "2", "steps": "4"}
@@ -427,6 +430,7 @@ def test_recovered_light_is_reused(folder: Path, finished: Path, tmp_path: Path)
     assert digest(out)["curves.json"] == digest(finished)["curves.json"]
 
 
+@pytest.mark.slow
 def test_recovered_lamps_light_the_picture_and_are_written(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     lamp = {"lamp": "0.8,1.5,-3,0.1,20,1,0.5,0.25", "recover_lamps": ""}

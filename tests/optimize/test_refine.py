@@ -376,6 +376,7 @@ def test_tone_gradient_matches_central_differences(rng: np.random.Generator) -> 
             assert match.relative_l2 <= RELATIVE_L2, match
 
 
+@pytest.mark.slow
 def test_material_is_found_again() -> None:
     """From matte grey to paint and metal, toward a true composite of other samples."""
     true = balls(TRUE)
@@ -403,6 +404,7 @@ def test_frozen_parts_and_materials_stay() -> None:
     assert replace(left, base_color=TRUE[0].base_color) == TRUE[0]
 
 
+@pytest.mark.slow
 def test_emission_is_found_again() -> None:
     """A ball that glows red, and one that does not, both from the start value."""
     glow = (0.6, 0.15, 0.05)
@@ -675,6 +677,7 @@ def test_refined_material_is_written_and_rendered(
     assert any(said in line for line in record_of(third)["notices"])
 
 
+@pytest.mark.slow
 def test_refinement_replays(refined: Path, tmp_path: Path) -> None:
     out = tmp_path / "replayed"
     assert main(["--config", str(refined / "run.json"), "--out", str(out)]) == ExitCode.DONE
@@ -682,6 +685,7 @@ def test_refinement_replays(refined: Path, tmp_path: Path) -> None:
         assert digest(out)[name] == digest(refined)[name]
 
 
+@pytest.mark.slow
 def test_refinement_judges_with_the_earlier_runs_operator(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

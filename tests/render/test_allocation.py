@@ -151,6 +151,7 @@ def sun() -> Light:
     return Light(lobes=Lobes(*lobes))
 
 
+@pytest.mark.slow
 def test_highlights_of_metal(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Less than half of the variance, the same mean, shares of the work in order.
 

@@ -75,6 +75,7 @@ def tiles(radiance: Float64Array) -> Float64Array:
     return np.concatenate([square, square.sum(axis=1, keepdims=True)], axis=1)
 
 
+@pytest.mark.slow
 def test_no_bias(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight candidates against one, in open light and in shadow, over many seeds of few samples."""
     picked = runs(device, a_crowd(), colored_suns(), SEEDS)

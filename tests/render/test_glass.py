@@ -312,6 +312,7 @@ def test_black_absorption_and_infinite_index_are_finite(device: str) -> None:
             assert r.bad_pixels.count == 0
 
 
+@pytest.mark.slow
 def test_lamp_is_seen_through_glass(device: str) -> None:
     """From within a lamp that is all around, glass vanishes as in an even sky."""
     around = SphereLamp(np.array([3.0, -1.0, 2.0]), 40.0, np.full(3, 4.0 * np.pi**2 * 40.0**2))

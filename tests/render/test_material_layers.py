@@ -147,6 +147,7 @@ def test_stretch_without_direction_is_none(device: str) -> None:
         np.testing.assert_array_equal(*found)
 
 
+@pytest.mark.slow
 def test_film_has_the_thickness_of_its_texture(device: str) -> None:
     """The green channel lies between the bounds; without a texture the upper one counts."""
     texture = Texture(np.full((1, 1, 4), CODES, np.uint8))
@@ -211,6 +212,7 @@ def test_sheen_lets_through_what_is_below_it(device: str, angle: float) -> None:
     assert out.radiance.mean() - out.mask.mean() == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.0, 60.0])
 def test_soap_film_reflects_what_it_keeps(device: str, angle: float) -> None:
     """A film on glass passes what its brightest colour leaves, and shows its own colours."""

@@ -63,6 +63,7 @@ def test_batches_hold_what_they_promise(device: str) -> None:
     assert ((batch.share >= 0.0) & (batch.share <= 1.0)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_function_of_seed_and_index(device: str) -> None:
     pool = even(device, 3.0)
     first = generator(pool).photo_batch(7, 6)

@@ -205,6 +205,7 @@ def test_place_of_a_lamp_above_ground_and_card_is_that_of_closed_forms(
             assert np.abs(error.mean(axis=0)).max() < 0.005 * size, axis
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [0, 1])
 def test_place_moves_a_penumbra(kind: int, device: str) -> None:
     """A card's edge hides part of a lamp: the visible part's closed form, in float64."""

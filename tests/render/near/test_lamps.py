@@ -131,6 +131,7 @@ def test_lamps_fall_off_on_object_and_ground(kind: int, height: float, device: s
         assert found.mean() == pytest.approx(true.mean(), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [0, 1])
 def test_lamps_penumbra_is_the_part_of_the_lamp_in_view(kind: int, device: str) -> None:
     """A card's edge hides part of a lamp: surface points of the lamp, one by one, in float64."""

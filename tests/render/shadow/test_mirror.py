@@ -99,6 +99,7 @@ def test_white_ball_in_a_furnace_is_not_seen_in_the_mirror(device: str, roughnes
     assert abs(added.mean()) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
 def test_coat_under_a_black_dome_loses_its_albedo(device: str, roughness: float) -> None:
     """Where every reflection meets a black wall, the image is minus the coat's albedo."""
