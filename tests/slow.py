@@ -13,8 +13,10 @@ NO_TIME = "no time is left for it"
 class SlowTests:
     """Part of a run of pytest that leaves out slow tests for which there is no time.
 
-    Those of numbered cases always run, since docs/robustness.md tells of all. Files come in an
-    order that differs from run to run, so that it is not the same tests that are left out.
+    Those of numbered cases always run, and come first, since docs/robustness.md tells of all. The
+    others come by files, in an order that differs from run to run, so that it is not the same tests
+    that are left out. Processes that share them keep to it with ``--dist loadgroup
+    --no-loadscope-reorder``.
 
     Args:
         until: When the last of the others may start [s since 1970].
@@ -23,17 +25,19 @@ class SlowTests:
     def __init__(self, until: float) -> None:
         self.until = until
 
-    @pytest.hookimpl(trylast=True)
+    @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Put files with cases first, and in each file the tests of cases."""
-        with_cases = {str(item.path) for item in items if cases_of(item)}
+        """Group the tests by file and by whether they are of cases, and order the groups."""
 
-        def turn(item: pytest.Item) -> tuple[bool, str, bool]:
-            path = str(item.path)
-            digest = hashlib.sha256(f"{self.until} {path}".encode()).hexdigest()
-            return path not in with_cases, digest, not cases_of(item)
+        def turn(item: pytest.Item) -> tuple[bool, str]:
+            digest = hashlib.sha256(f"{self.until} {item.path}".encode()).hexdigest()
+            return not cases_of(item), digest
 
         items.sort(key=turn)
+        for item in items:
+            kind = "cases" if cases_of(item) else "others"
+            group = f"{item.nodeid.partition('::')[0]} {kind}"
+            item.add_marker(pytest.mark.xdist_group(group))
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Leave the test out if it is too late."""

@@ -25,7 +25,7 @@ def test_of_another(x): pass
 
 @pytest.mark.parametrize("is_late", [False, True])
 def test_slow_tests_run_while_there_is_time(tmp_path: Path, is_late: bool) -> None:
-    """Quick tests and numbered cases always do; cases come first, as does the file with them."""
+    """Quick tests and numbered cases always do; cases come first."""
     for name in ("test_a.py", "test_b.py"):
         content = CONTENT if name == "test_b.py" else CONTENT.partition("@pytest.mark.case")[0]
         (tmp_path / name).write_text(content.removesuffix("@pytest.mark.slow\n"))
