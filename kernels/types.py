@@ -306,8 +306,8 @@ class GlassArgs:
 class LightRecord:
     """How each pixel depends on the light: ``radiance = sum_j weight[j] * L(wi[j])``.
 
-    Rows are pixels; the first ``count`` entries of a row are filled. Without arrays nothing is
-    recorded.
+    Rows are pixels, or the threads that share one; the first ``count`` entries of a row are filled.
+    Without arrays nothing is recorded.
     """
 
     count: wp.array[int]

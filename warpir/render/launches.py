@@ -275,7 +275,7 @@ class ReceiverLaunch:
         pixels, may_see_object, may_gain = seen
         count = len(pixels)
         out = [renderer.zeros(count, wp.vec3) for _ in range(2)]
-        scene = [
+        common = [
             Rows(uploaded(renderer, pixels, self.camera_args)),
             Rows(renderer.upload(may_see_object, wp.int32)),
             self.camera_args,
@@ -285,10 +285,10 @@ class ReceiverLaunch:
         rows, work = map(Rows, out), spp * self.rays
         shared = [spp // lanes, self.rays, lanes, self.seed, *rows]
         if self.plane_radiance is not None:
-            args = [*scene, wp.vec3(*map(float, self.plane_radiance)), *shared]
+            args = [*common, wp.vec3(*map(float, self.plane_radiance)), *shared]
             kernel = plane_shadow_kernel(renderer.scene.has_passing)
         else:
-            args = [*scene, *shared, LightRecord() if record is None else Rows(record)]
+            args = [*common, *shared, LightRecord() if record is None else Rows(record)]
             kernel = trace_receiver
         renderer.launch(kernel, count, args, work, "shadow", lanes)
         lit, unoccluded = (a.numpy()[:count] for a in out)
