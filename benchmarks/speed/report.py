@@ -36,7 +36,7 @@ gradient by Dr.Jit's automatic differentiation. Its sampler is `ldsampler`, with
 eighth of `independent`'s time to an image of equal error here, a third to a gradient; its functions
 are frozen (`dr.freeze`), so that Python does not trace them again in each step; where Dr.Jit
 refuses that (ToyCar and `textured` on CUDA, run with `--no-freeze`), Mitsuba's pictures of the
-object hold 30 to 40 ms of tracing, its time at 4 samples, and its steps 80 to 120 ms: there the
+object hold 30 to 45 ms of tracing, its time at 4 samples, and its steps 80 to 120 ms: there the
 ratios flatter us, those of pictures by up to a quarter, those of steps by up to seven tenths, and
 those of `expects_light False` there are nearly all Python.
 Kernels are compiled and scenes built before the clock runs.
