@@ -143,14 +143,6 @@ def test_layers_rooms_are_small_and_say_what_they_are() -> None:
     }
 
 
-def test_layers_imports_are_absolute() -> None:
-    """Tests, benchmarks, tools and notebooks too."""
-    for path in sources("warpir", "kernels", "diffusion", "tests", "benchmarks", "tools"):
-        for line, target in imports(path):
-            assert not target.startswith("."), f"{path}, line {line}: relative import"
-            assert target.split(".")[0] not in ("kernels", "diffusion"), f"{path}, line {line}"
-
-
 def test_layers_plain_modules_need_no_torch() -> None:
     """Command line and file checks answer without torch, in functions too."""
     plain = [path for path in sources("diffusion") if path.stem in PLAIN - {"prompts"}]

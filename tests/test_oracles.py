@@ -219,6 +219,7 @@ def test_gltf_brdf_mixes_two_materials() -> None:
     assert np.pi * diffuse == pytest.approx(0.48)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cos_o, alpha, f0", [(1.0, 1.0, 1.0), (0.7, 0.5, 0.04), (0.2, 0.3, 1.0)])
 def test_specular_albedo_by_quadrature(cos_o: float, alpha: float, f0: float) -> None:
     """Half-vector quadrature against scipy over incident directions."""

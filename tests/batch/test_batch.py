@@ -349,6 +349,7 @@ def test_a_folder_of_another_user_ends_no_batch(
     assert "2 of 2 scenes failed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_validate_looks_at_all_lines_and_writes_nothing(
     memory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -223,6 +223,7 @@ def test_losses_of_the_base_model_do_without_an_adapter(
     torch.testing.assert_close(found[0], expected, rtol=FLOAT32, atol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_work_is_the_difference_of_the_potential(rng: np.random.Generator) -> None:
     """Along a straight way the work of SDS at g = 1 is the rise of the noised -log p, in the mean.
 
@@ -773,6 +774,7 @@ def test_gradient_passes_autoencoder_and_crop(rng: np.random.Generator, folder: 
     assert match.relative_l2 < 1e-6  # latents and residual pass through float32
 
 
+@pytest.mark.slow
 def test_guidance_works_without_the_text_encoder(rng: np.random.Generator, folder: Path) -> None:
     """Every loss embeds what it needs when it is made; score and precision need no more."""
     x, mask = photo(rng)

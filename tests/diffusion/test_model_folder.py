@@ -507,6 +507,7 @@ def test_weights_that_are_not_finite_are_refused(folder: Path, name: str, value:
     refuse(folder, str(Path(name).parent), "not finite")
 
 
+@pytest.mark.slow
 @pytest.mark.case("L2")
 @settings(
     max_examples=200,

@@ -127,6 +127,7 @@ def hash_of_weights(prior: StableDiffusion) -> str:
 # Learning
 
 
+@pytest.mark.slow
 def test_the_model_comes_closer_to_the_photo(prior: StableDiffusion) -> None:
     """The error on fixed draws falls, and the losses of both kinds are kept."""
     settings = replace(SETTINGS, lora_steps=60, lora_rate=1e-2)

@@ -446,6 +446,7 @@ def test_main_scores_maps_that_another_system_made(data: Path, tmp_path: Path) -
     assert summary["uniform"]["all"]["image.full.rmse"]["mean"] > 0.01
 
 
+@pytest.mark.slow
 def test_scenes_without_a_map_or_a_kind_are_left_out(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -243,6 +243,7 @@ def test_missing_package(
     assert lines[1] == f"pip install {advice} brings it"
 
 
+@pytest.mark.slow
 def test_run_without_a_model_does_not_import_torch(inputs: Path) -> None:
     """Camera and light are estimated and the picture is written without it: seconds, 200 MB."""
     argv = arguments(inputs, "out", light=None, camera=None, horizon=None, fov=None)

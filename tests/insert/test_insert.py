@@ -375,6 +375,7 @@ def test_sun_and_sky_flags_light_the_scene(
         assert lit.record["measured"]["exposure_ev"] == -1.0
 
 
+@pytest.mark.slow
 def test_without_a_light_the_photo_is_asked(inputs: Path, tmp_path: Path, device: str) -> None:
     """--guidance none lights the object as the regressor says, at the photo's own exposure."""
     weights = tmp_path / "regressor.safetensors"
@@ -470,6 +471,7 @@ def test_demo_runs_small(tmp_path: Path, device: str) -> None:
     assert checked.found == {"is_done": True}, "a batch knows it by the files of the package"
 
 
+@pytest.mark.slow
 def test_more_samples_where_their_noise_would_be_seen(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

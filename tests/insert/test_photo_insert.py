@@ -188,6 +188,7 @@ def test_odd_sizes_are_whole_runs(inputs: Path, tmp_path: Path, size: tuple[int,
     np.testing.assert_array_equal(done.image()[kept], codes[kept])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0, 255], ids=["I16-black", "I16-white"])
 def test_photos_without_signal_are_whole_runs(inputs: Path, tmp_path: Path, level: int) -> None:
     """The run says so, also where the light is read off the photo, and holds no NaN."""

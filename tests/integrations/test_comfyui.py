@@ -128,6 +128,7 @@ def test_object_is_inserted(nodes: ModuleType, tmp_path: Path) -> None:
     assert (Path(folder) / "report.html").is_file() and Path(light).is_file()
 
 
+@pytest.mark.slow
 def test_cancelling_stops_an_insertion(
     nodes: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +161,7 @@ def test_cancelling_stops_an_insertion(
     assert (Path(folder) / "composite.png").is_file() and asked > 10
 
 
+@pytest.mark.slow
 def test_linked_light_keeps_its_level(nodes: ModuleType, tmp_path: Path) -> None:
     """The estimated map has the photo's level, which another map is scaled to."""
     write_inputs(tmp_path)

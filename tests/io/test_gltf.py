@@ -233,8 +233,9 @@ FAULTS = {
         lambda b: b.json.update(nodes=[{"mesh": 0}] * 2**18),
         "limit.nodes", "/nodes", found=262144, limit=100000),
     "M10-G28-too-many-placed": fault(
-        lambda b: b.json.update(
-            nodes=[{"mesh": 0}] * 70_000, scenes=[{"nodes": list(range(70_000))}]),
+        lambda b: (
+            b.json["meshes"][0].update(primitives=[b.primitive] * 300),
+            b.json.update(nodes=[{"mesh": 0}] * 300, scenes=[{"nodes": list(range(300))}])),
         "limit.instances", "/", found=65537, limit=65536),
     "M6-G23-sparse-zeros": fault(
         zeros, "gltf.too_large", "/accessors/0", found=360000000, limit=268435456),

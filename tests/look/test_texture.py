@@ -25,6 +25,7 @@ def other_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
     texture._network.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blur", [0.3, 0.8, 1.4])
 def test_blur_of_made_up_pictures_is_found(blur: float) -> None:
     """Of pictures that were not learned from: within .15 px in the mean, no step being sought."""

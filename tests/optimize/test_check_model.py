@@ -50,6 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
 def test_random_weights_are_not_a_trained_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
@@ -151,6 +152,7 @@ def test_verdicts(verdict: Verdict, ok: bool) -> None:
     assert (verdict.expected in verdict.line) is not ok
 
 
+@pytest.mark.slow
 def test_guidance_that_is_never_finite_is_a_verdict(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -182,6 +184,7 @@ def test_bad_input_is_one_line(
     assert words in error and error.count("error:") == 1 and "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_a_report_that_cannot_be_written_comes_after_the_verdicts(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -231,6 +231,7 @@ def test_resume_without_a_checkpoint_starts_and_says_so(
     assert main([*argv(folder, out), "--resume"]) == ExitCode.OUTPUT
 
 
+@pytest.mark.slow
 @pytest.mark.case("L9")
 def test_resume_refuses_another_model(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

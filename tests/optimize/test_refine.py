@@ -391,6 +391,7 @@ def test_material_is_found_again() -> None:
     assert loop.state.best_score < 0.02 * before
 
 
+@pytest.mark.slow
 def test_frozen_parts_and_materials_stay() -> None:
     """Base colour of one ball is found; the other's and all other factors are the asset's."""
     start = (replace(TRUE[0], base_color=(0.5,) * 3), TRUE[1])
@@ -733,6 +734,7 @@ def test_emission_refinement_runs(folder: Path, tmp_path: Path, no_bounce: str |
     assert {k: entry[k] for k in LOWEST} == {k: entry["before"][k] for k in LOWEST}
 
 
+@pytest.mark.slow
 def test_tone_refinement_runs_on_an_altered_photo(folder: Path, tmp_path: Path) -> None:
     """Another photo of the place: curves move from the earlier run's, light and materials stay."""
     out = tmp_path / "out"

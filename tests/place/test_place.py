@@ -88,6 +88,7 @@ def test_placement_in_the_world_of_the_camera_file(inputs: Path, tmp_path: Path)
     assert "sun" not in saved and "sky" not in saved
 
 
+@pytest.mark.slow
 def test_start_shows_what_insert_would_refuse(inputs: Path, tmp_path: Path) -> None:
     """An asset in millimetres, in which the camera would stand, starts small and in view."""
     huge = trimesh.creation.box(extents=(900.0, 700.0, 2000.0))

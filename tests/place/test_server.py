@@ -75,6 +75,7 @@ def ask(served: Served, *requests: tuple[str, str, str, str]) -> list[tuple[int,
     return [(int(status), base64.b64decode(content)) for status, _, content in answers]
 
 
+@pytest.mark.slow
 def test_server_answers_its_own_page_only(inputs: Path, tmp_path: Path) -> None:
     """Wrong token, wrong host, paths that lead out, unknown names get nothing; Ctrl-C ends it."""
     with serve(command(inputs, tmp_path / "out")) as served:
@@ -106,6 +107,7 @@ def test_server_answers_its_own_page_only(inputs: Path, tmp_path: Path) -> None:
         assert "stopped by SIGINT" in shown and "Traceback" not in shown
 
 
+@pytest.mark.slow
 def test_server_says_who_may_show_it(inputs: Path, tmp_path: Path) -> None:
     """Every answer forbids what the page does not need."""
     with serve(command(inputs, tmp_path / "out")) as served:

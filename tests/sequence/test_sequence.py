@@ -264,6 +264,7 @@ def test_renewed_sequence_keeps_what_is_done(
         insert_now(config, renews=True)
 
 
+@pytest.mark.slow
 def test_batch_looks_at_all_that_a_sequence_takes(
     frames: tuple[list[str], Path], inputs: Path, first: Run, tmp_path: Path
 ) -> None:

@@ -107,6 +107,7 @@ def test_frames_rendered_again_are_those_of_the_whole_run(
         assert outcome(out / name) == outcome(whole / name)
 
 
+@pytest.mark.slow
 def test_toned_frame_tones_all_of_its_size(inputs: Path, tmp_path: Path) -> None:
     """Also a frame of few tones, which alone would be taken for one in colour."""
     for name, scene in (("1.png", a_scene()), ("2.png", a_scene(0.4, 0.8))):
@@ -124,6 +125,7 @@ def test_toned_frame_tones_all_of_its_size(inputs: Path, tmp_path: Path) -> None
     assert first["toning"] == second["toning"] and second["frame"] == "0001"
 
 
+@pytest.mark.slow
 def test_given_values_are_no_frames(
     film: tuple[list[str], Path, Run], inputs: Path, tmp_path: Path
 ) -> None:

@@ -305,6 +305,7 @@ def test_published_poly_haven_table_comes_out(
         assert any(f"| {name} | 11 | {images_printed} | {votes_printed} |" in x for x in lines)
 
 
+@pytest.mark.slow
 def test_published_waymo_table_comes_out(tmp_path: Path) -> None:
     """Main paper's Waymo table: four baselines, 48 scenes in four groups and together."""
     groups = [name for name, count in WAYMO_GROUPS.items() for _ in range(count)]

@@ -193,6 +193,7 @@ def test_lamps_on_the_ground_light_it_and_shine_no_way_through(device: str) -> N
     assert foreground(renderer(upright, [before], VIEW, device)).radiance.max() == 0.0
 
 
+@pytest.mark.slow
 def test_lamps_beside_light_at_infinity_add_up(device: str) -> None:
     """Radiance and both halves are sums over the lights; sun, sky, two lamps, three bounces."""
     parts = [sphere((0.0, 0.6, 0.0), 0.5, 3), quad((0.9, 0.5, 0.0), (0, 0, -0.5), (0.0, 0.5, 0.0))]

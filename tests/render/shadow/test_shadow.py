@@ -109,6 +109,7 @@ def test_interpolation_is_nearer_to_the_truth_than_tracing_each_pixel(device: st
     assert np.abs(error).max() < 2.0 * BEND and np.abs(error.mean()) < 3e-4
 
 
+@pytest.mark.slow
 def test_light_that_the_ball_throws_is_interpolated_too(device: str) -> None:
     renderer, light = ball(device, bounce_depth=3), sunny()
     quality = replace(QUALITY, samples=64)
