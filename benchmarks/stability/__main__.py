@@ -3,9 +3,9 @@
     python -m benchmarks.stability [--device cpu|cuda] [--json FILE] [--docs FILE]
 
 Lobes, materials, geometry, light, tone and fusion at the ends of their ranges. Truth comes from the
-float64 oracles of the tests, closed forms and quadrature, never from the kernels. `tests/
-test_stability.py` asserts the bounds of the same cases. Mitsuba's part is left out, and says so,
-where it is not installed.
+float64 oracles of the tests, closed forms and quadrature, never from the kernels.
+`tests/benchmarks/test_stability.py` asserts the bounds of the same cases. Mitsuba's part is left
+out, and says so, where it is not installed.
 """
 
 import math
