@@ -27,7 +27,7 @@ from warpir.scene.light import Light
 from warpir.scene.tone_curves import Curves
 
 SAMPLES = (4, 8, 16, 32, 64, 128)
-CASES = (*product(SAMPLES, ("plain", "denoised")), (40, "plain"), (40, "by noise"))
+CASES = (*product(SAMPLES, ("plain", "denoised")), (32, "by noise"))
 """Samples, and what is done about noise."""
 FIGURES = ("seconds", "object", "shadow")
 

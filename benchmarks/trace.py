@@ -14,7 +14,7 @@ from benchmarks.measure import context, flags, report, seconds
 from benchmarks.scenes import on_the_ground
 from warpir.io.assets import load_asset
 from warpir.kernels.maths.frame import basis, to_world
-from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair, to_unit
 from warpir.kernels.receiver_mesh import INFINITY
 from warpir.kernels.sampling import cosine_sample
 from warpir.kernels.tracing.hit import offset_origin
@@ -48,7 +48,7 @@ def cast(
     pixel = pixels[i]
     key = pixel_seed(0, pixel)
     ray_dir = camera_ray(camera, pixel, sobol_pair(0, key, 0))
-    draw = hash_pair(key, wp.uint32(0))
+    draw = to_unit(hash_pair(key, wp.uint32(0)))
     hit = closest_hit(mesh, material, texture, camera.origin, ray_dir, INFINITY, 1, draw)
     total = float(hit.valid)
     if hit.valid == 1 and shadow_rays > 0:

@@ -132,9 +132,8 @@ def scatter(
 
     # Sample the BSDF, continue the path
     u = sobol_pair(index, key, 3 * vertex + 3)
-    ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
     sample = sample_bsdf(
-        mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
+        mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts, is_last
     )
     out.bsdf = sample
     f_sample = sample.f.diffuse + sample.f.specular
@@ -422,9 +421,9 @@ def foreground_kernel(
                     first.valid = 0
                     if ray.weight > 0.0:
                         reach = receiver_mesh_hit(receiver, origin, ray.direction).t
-                        ray_key = hash_pair(hash_pair(key, wp.uint32(path)), wp.uint32(1))
+                        u_passing = sobol_pair(path, key, 1)[0]
                         first = closest_hit(
-                            mesh, material, texture, origin, ray.direction, reach, 0, ray_key
+                            mesh, material, texture, origin, ray.direction, reach, 0, u_passing
                         )
                     if wp.static(in_mirror):
                         if ray.weight > 0.0:

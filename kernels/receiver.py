@@ -18,7 +18,7 @@ from warpir.kernels.dielectric.interface import fresnel_dielectric
 from warpir.kernels.light_gradient import keep_direction
 from warpir.kernels.maths.frame import Frame, basis, to_local, to_world
 from warpir.kernels.maths.lanes import lane_sum
-from warpir.kernels.maths.rng import hash_pair, pixel_seed, sobol_pair
+from warpir.kernels.maths.rng import pixel_seed, sobol_pair
 from warpir.kernels.receiver_mesh import (
     plane_distance,
     receiver_mesh_hit,
@@ -51,9 +51,6 @@ most of the noise, and what the light sends there is cheap to draw."""
 
 GROUND_IOR = wp.constant(1.5)
 """Refractive index of a glossy ground's coat [1]."""
-
-BOUNCE_KEY = wp.constant(wp.uint32(0x2545F491))
-"""Keeps the draws of what the object lets through of the mesh's light apart from the camera's."""
 
 
 @wp.struct
@@ -136,8 +133,8 @@ def receiver_sample(
         receiver_hit = receiver_mesh_hit(receiver, origin, wi)
         if receiver_hit.valid == 1:
             out.bounced = receiver_radiance(receiver, receiver_hit)
-            ray_key = hash_pair(hash_pair(key, BOUNCE_KEY), wp.uint32(index))
-            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, ray_key)
+            u_passing = sobol_pair(index, key, 1)[0]
+            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, u_passing)
             out.visible_cosine = 1.0 - float(hit.valid)
             return out
         Li = light_eval(light, wi)

@@ -335,9 +335,8 @@ def sample_bsdf(
     bsdf: Bsdf,
     frame: Frame,
     u: wp.vec2,
-    u_lobe: float,
+    u_parts: wp.vec2,
     is_last: int,
-    ray_key: wp.uint32,
 ) -> BsdfSample:
     """Draw a direction from the BSDF and trace it; the path may go on along it.
 
@@ -350,16 +349,15 @@ def sample_bsdf(
         bsdf: How, toward the camera.
         frame: Of the shading normal.
         u: Uniform numbers.
-        u_lobe: Another, which picks the lobe.
+        u_parts: Two more: what the ray passes (`closest_hit`), and which lobe is picked.
         is_last: 1 when nothing behind this vertex can add light, so that any hit will do.
-        ray_key: Of the ray's own random numbers.
     """
     sample = BsdfSample()
     sample.cos_over_pdf = 0.0
     sample.visible = 0.0
     sample.from_receiver = 0
     sample.next.valid = 0
-    wi = bsdf_sample(bsdf, u, u_lobe)
+    wi = bsdf_sample(bsdf, u, u_parts[1])
     sample.wi = to_world(wi, frame)
     if wi[2] > 0.0 and wp.dot(sample.wi, surface.ng) > 0.0 and bsdf.wo[2] > 0.0:
         sample.f = bsdf_f(bsdf, wi)
@@ -371,7 +369,7 @@ def sample_bsdf(
                 sample.visible = visibility(mesh, material, texture, origin, sample.wi)
             else:
                 sample.next = closest_hit(
-                    mesh, material, texture, origin, sample.wi, ended.t, 0, ray_key
+                    mesh, material, texture, origin, sample.wi, ended.t, 0, u_parts[0]
                 )
                 if sample.next.valid == 0 and ended.valid == 0:
                     sample.visible = 1.0

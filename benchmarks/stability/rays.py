@@ -46,7 +46,7 @@ def hit_kernel(
 ):
     """First hit of each ray; ``face`` is -1 without one."""
     i = wp.tid()
-    hit = closest_hit(mesh, material, texture, origin[i], direction[i], 1.0e30, 0, wp.uint32(0))
+    hit = closest_hit(mesh, material, texture, origin[i], direction[i], 1.0e30, 0, 0.0)
     face[i] = -1
     if hit.valid == 1:
         face[i] = hit.face

@@ -291,9 +291,12 @@ def trace_from_glass(
     surface: Surface,
     point: GlassPoint,
     drawn: BsdfSample,
-    ray_key: wp.uint32,
+    u_passing: float,
 ) -> Scatter:
-    """Trace a drawn direction: to the object, else to what the photo shows, else to the light."""
+    """Trace a drawn direction: to the object, else to what the photo shows, else to the light.
+
+    ``u_passing`` is the number of `closest_hit`.
+    """
     out = Scatter()
     sample = drawn
     origin = offset_origin(surface.position, surface.ng, sample.wi, mesh.epsilon)
@@ -306,7 +309,7 @@ def trace_from_glass(
         shown = photo_between(receiver, ground)
         if shown[3] > 0.0:
             reach = wp.min(reach, ground.t + slack(receiver, ground, sample.wi))
-    sample.next = closest_hit(mesh, material, texture, origin, sample.wi, reach, 0, ray_key)
+    sample.next = closest_hit(mesh, material, texture, origin, sample.wi, reach, 0, u_passing)
     if shown[3] == 0.0 and wall.valid == 1 and receiver.shines == 1:
         shown = photo_between(receiver, wall)
     out.weight_bsdf = 0.0
@@ -364,9 +367,8 @@ def scatter_at_glass(
     drawn = glass_direction(surface, point.eta, wo, u, u_parts[1])
     out = Scatter()
     if drawn.cos_over_pdf > 0.0:
-        ray_key = hash_pair(hash_pair(key, wp.uint32(index)), wp.uint32(vertex + 1))
         out = trace_from_glass(
-            mesh, material, texture, receiver, light, surface, point, drawn, ray_key
+            mesh, material, texture, receiver, light, surface, point, drawn, u_parts[0]
         )
         out.direct = wp.cw_mul(drawn.f.specular, out.L_bsdf) * out.weight_bsdf
         if lamps.count > 0:

@@ -202,9 +202,9 @@ def trace_places(
                 ray = object_ray(object_window(mesh, origin, point.normal), sobol_pair(s, key, 3))
                 if ray.weight > 0.0:
                     reach = receiver_mesh_hit(receiver, origin, ray.direction).t
-                    ray_key = hash_pair(hash_pair(key, wp.uint32(s)), wp.uint32(1))
+                    u_passing = sobol_pair(s, key, 1)[0]
                     hit = closest_hit(
-                        mesh, material, texture, origin, ray.direction, reach, 0, ray_key
+                        mesh, material, texture, origin, ray.direction, reach, 0, u_passing
                     )
                 wo = -ray.direction
                 throughput = wp.vec3(ray.weight)
@@ -222,10 +222,9 @@ def trace_places(
                 mesh, material, texture, receiver, lamps, surface, bsdf, frame, throughput,
                 sobol_pair(s, rim_key, k),
             )  # fmt: skip
-            ray_key = hash_pair(hash_pair(key, wp.uint32(s)), wp.uint32(k + 1))
             sample = sample_bsdf(
                 mesh, material, texture, receiver, surface, bsdf, frame,
-                sobol_pair(s, key, 3 * k + 3), sobol_pair(s, key, 3 * k + 1)[1], 0, ray_key,
+                sobol_pair(s, key, 3 * k + 3), sobol_pair(s, key, 3 * k + 1), 0,
             )  # fmt: skip
             hit = sample.next
             f = sample.f.diffuse + sample.f.specular

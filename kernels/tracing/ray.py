@@ -5,7 +5,7 @@ Detached: no backward pass.
 
 import warp as wp
 
-from warpir.kernels.maths.rng import hash_pair, to_unit
+from warpir.kernels.maths.rng import sobol_pair
 from warpir.kernels.receiver_mesh import INFINITY, plane_distance, receiver_mesh_hit
 from warpir.kernels.tracing.coverage import hit_alpha
 from warpir.kernels.tracing.hit import ULP, Hit, face_normal, hit_position, offset_origin
@@ -19,6 +19,8 @@ from warpir.kernels.types import CameraArgs, MaterialArgs, MeshArgs, ReceiverArg
 
 LAYERS_MAX = wp.constant(64)
 """Surfaces that one ray may pass through; a safety bound, not a quality setting."""
+CAMERA_PASSING = wp.constant(1 << 16)
+"""Pair of dimensions whose first number decides what a camera ray passes; vertices have others."""
 
 
 @wp.func
@@ -106,7 +108,7 @@ def closest_of_layers(
     ray_dir: wp.vec3,
     max_t: float,
     is_camera_ray: int,
-    key: wp.uint32,
+    u: float,
 ) -> Hit:
     """Find what `closest_hit` does where materials let rays pass.
 
@@ -116,7 +118,8 @@ def closest_of_layers(
     hit = Hit()
     hit.valid = 0
     origin = ray_origin
-    for layer in range(LAYERS_MAX):
+    left = float(u)
+    for _layer in range(LAYERS_MAX):
         hit = closest_triangle(mesh, origin, ray_dir, max_t)
         if hit.valid == 0:
             return hit
@@ -132,9 +135,10 @@ def closest_of_layers(
                     hit = twin
         if accept == 1 and hit.face >= mesh.passing_start:
             alpha = hit_alpha(mesh, material, texture, hit, ray_dir)
-            if alpha < 1.0:
-                if to_unit(hash_pair(key, wp.uint32(layer))) >= alpha:
-                    accept = 0
+            if alpha < 1.0 and left >= alpha:
+                # What is left of the number is uniform again.
+                accept = 0
+                left = (left - alpha) / (1.0 - alpha)
         if accept == 1:
             hit.valid = 1
             return hit
@@ -155,12 +159,13 @@ def closest_hit(
     ray_dir: wp.vec3,
     max_t: float,
     is_camera_ray: int,
-    key: wp.uint32,
+    u: float,
 ) -> Hit:
     """Find the first surface that the ray does not pass through.
 
     A camera ray passes the back of a single-sided material; any ray passes a point of opacity alpha
-    with probability ``1 - alpha``, drawn from ``key``.
+    where the uniform number ``u`` is not below it. One number does for all such points of a ray, so
+    that a pixel's samples, stratified in it, leave little noise of what they pass.
     """
     # A call copies all of its structs, which takes as long as the ray.
     hit = closest_triangle(mesh, ray_origin, ray_dir, max_t)
@@ -172,7 +177,7 @@ def closest_hit(
             may_pass = is_culled(mesh, material, hit.face, ray_dir)
     if may_pass == 1:
         return closest_of_layers(
-            mesh, material, texture, ray_origin, ray_dir, max_t, is_camera_ray, key
+            mesh, material, texture, ray_origin, ray_dir, max_t, is_camera_ray, u
         )
     return hit
 
@@ -193,9 +198,8 @@ def camera_hit(
     ``ray_dir`` is `camera_ray` at ``sobol_pair(s, key, 0)``.
     """
     reach = camera_reach(receiver, camera.origin, ray_dir)
-    return closest_hit(
-        mesh, material, texture, camera.origin, ray_dir, reach, 1, hash_pair(key, wp.uint32(s))
-    )
+    u = sobol_pair(s, key, CAMERA_PASSING)[0]
+    return closest_hit(mesh, material, texture, camera.origin, ray_dir, reach, 1, u)
 
 
 @wp.func

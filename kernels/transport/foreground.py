@@ -351,9 +351,8 @@ def trace_paths(
 
         # Sample the BSDF, continue the path
         u = sobol_pair(q, key, 3 * k + 3)
-        ray_key = hash_pair(hash_pair(key, wp.uint32(q)), wp.uint32(k + 1))
         sample = sample_bsdf(
-            mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts[1], is_last, ray_key
+            mesh, material, texture, receiver, surface, bsdf, frame, u, u_parts, is_last
         )
         f = sample.f.diffuse + sample.f.specular
         if sample.from_receiver == 1:

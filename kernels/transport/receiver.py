@@ -299,8 +299,8 @@ def trace_bounced(
         if receiver_hit.valid == 1:
             L = receiver_radiance(receiver, receiver_hit)
             total += L
-            ray_key = hash_pair(key, wp.uint32(q))
-            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, ray_key)
+            u_passing = sobol_pair(q, key, 1)[0]
+            hit = closest_hit(mesh, material, texture, origin, wi, receiver_hit.t, 0, u_passing)
             if hit.valid == 1:
                 kept += L
     received[p] = total / float(path_count)

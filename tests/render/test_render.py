@@ -592,6 +592,14 @@ def test_M19_blend_lets_its_share_through(device: str) -> None:
     np.testing.assert_allclose(roofed(device, glass, color=half), 0.875, rtol=FLOAT32)
 
 
+def test_what_rays_pass_leaves_little_noise(device: str) -> None:
+    """Of a pixel's 64 samples the right number stops at two panes, within one."""
+    panes = [quad((0, 0, -5.0 - k), (1.0 + k, 0, 0), (0, 1.0 + k, 0)) for k in range(2)]
+    scene = placed(panes, Material(alpha_mode="BLEND", alpha=0.3))
+    mask = render(make(scene, CARD_VIEW, device), constant(), 64).mask
+    assert np.abs(mask - (1.0 - 0.7**2)).max() <= 1.0 / 64 + FLOAT32
+
+
 @pytest.mark.case("M19")
 @pytest.mark.parametrize(
     ("mode", "alpha", "stays"),

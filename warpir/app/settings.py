@@ -200,17 +200,17 @@ class RenderConfig:
     """How the picture is rendered, and on what."""
 
     samples: int | None = option(None, "N", low=1, high=2**20)
-    """Mean samples per pixel, more where noise is (default: 40); without it up to four times as
-    many if their noise would be seen, within a few seconds, and above 3 megapixels the fewer, the
-    more pixels share what is seen, down to 16"""
+    """Mean samples per pixel, more where noise is (default: 32); without it a small object
+    has up to four times as many if their noise would be seen, and above 3 megapixels there are the
+    fewer, the more pixels share what is seen, down to 16"""
     rays: int = option(1, "N", low=1, high=2**10)
     """Rays per sample, of light and of surface each"""
     depth: int = option(5, "D", low=1, high=2**10)
     """Longest light path, in surface hits"""
-    indirect_limit: float = option(8.0, "RADIANCE", low=0)
-    """Most radiance after a path's first bounce (0: any); the limit, lower for what is thrown onto
-    dark ground and higher on a linear plate whose white is above 1, removes bright specks where a
-    mirror throws sunlight"""
+    indirect_limit: float = option(4.0, "RADIANCE", low=0)
+    """Most radiance after a path's first bounce (0: any); that is in a pixel of --samples, more in
+    one that gets more; the limit, lower for what is thrown onto dark ground and higher on a linear
+    plate whose white is above 1, removes bright specks where a mirror throws sunlight"""
     bounce: bool = option(True, expert=True)
     """Let the object throw light on the ground; what it reflects and emits there is in the shadow
     ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""
@@ -238,7 +238,7 @@ class RenderConfig:
         """Return the samples of each pixel of a picture of this size [px]."""
         if self.samples is not None:
             return self.samples
-        return min(40, max(16, round(40 * SAMPLED_PIXELS / (width * height))))
+        return min(32, max(16, round(32 * SAMPLED_PIXELS / (width * height))))
 
     @property
     def bounce_depth(self) -> int:

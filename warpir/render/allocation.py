@@ -59,8 +59,9 @@ STEPS = (-1, 3)
 pixel has less than half of them, whatever the pilot has missed."""
 MOST = 4.0
 """Samples of a picture whose noise is too much, over those asked for."""
-MORE_WORK = 1 << 21
-"""Samples that a picture has at most beyond those asked for: three seconds of two cores."""
+MUCH_WORK = 1 << 21
+"""Samples up to which a picture with too much noise has more than those asked for: three seconds of
+two cores, or twice that on a slow one."""
 DEVIATION_POWER = 0.85
 """Of a deviation, for its samples: 2 / (1 + b) where squared errors fall as n^-b."""
 FIREFLY = 0.3
@@ -114,7 +115,7 @@ def by_noise(
     if sharing is None or spp < LEAST_SAMPLES or work < least:
         return trace(np.arange(len(pixels), dtype=np.int32), spp, 0), float(spp)
     worth = WORTH * (1.0 + 2.0 * least / work)
-    most = 1.0 if sharing.noise is None else min(MOST, 1.0 + MORE_WORK / work)
+    most = 1.0 if sharing.noise is None else float(np.clip(MUCH_WORK / work, 1.0, MOST))
     try:
         steps, cost = _pilot(launcher, trace, sharing, pixels, (width, spp), (worth, most))
         out: Rows = ()

@@ -6,8 +6,8 @@ memory is short.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,7 @@ from warpir.kernels.path import Viewer, foreground_kernel
 from warpir.kernels.receiver import plane_shadow_kernel, trace_receiver
 from warpir.kernels.tracing.gbuffer import trace_gbuffer
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
+from warpir.render.allocation import pilot_seed
 from warpir.render.device import Rows
 
 if TYPE_CHECKING:
@@ -215,7 +216,7 @@ CANDIDATES = 8
 what is expected of all as its control variate. Seconds times squared error on two cores: a quarter
 of that of four without it on a matte ball, and two thirds on a metal one. Sixteen gain a fifth on
 the ball and lose as much on an object in its own shadow."""
-THROWN_LIMIT = 0.125
+THROWN_LIMIT = 0.25
 """Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
 radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""
 THROWN_SHARE = 3
@@ -343,3 +344,20 @@ class ReceiverLaunch:
             self.seed,
             is_recorded=self.is_recorded,
         )
+
+
+Launch = TypeVar("Launch", ObjectLaunch, ReceiverLaunch)
+
+
+def launch_of_part(launch: Launch, number: int, share: float) -> Launch:
+    """Return the launch of a part of a picture, or of a pilot (`warpir.render.allocation.Trace`).
+
+    Args:
+        launch: Of the picture.
+        number: 0 for the picture, else the pilot's.
+        share: Samples of the part's pixels over those asked for. The limit of a path grows with
+            them: a path may then add as much to a pixel that has few samples as to one of many.
+    """
+    if number:
+        return replace(launch, seed=pilot_seed(launch.seed, number))
+    return replace(launch, indirect_limit=launch.indirect_limit * share)

@@ -8,7 +8,7 @@ finite are black (`warpir.render.bad_pixels`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from warpir.kernels.maths.lanes import LANES_MAX
 from warpir.kernels.path import Viewer
 from warpir.kernels.shadow_ratio import shadow_ratio
 from warpir.kernels.types import CameraArgs, LightArgs, LightRecord, MaterialArgs, VertexRecord
-from warpir.render.allocation import Sharing, by_noise, pilot_seed
+from warpir.render.allocation import Sharing, by_noise
 from warpir.render.bad_pixels import BadPixels, all_finite, first_bad_sample_of
 from warpir.render.device import Launcher, Rows, load_kernels
 from warpir.render.device_light import PlaneLight, drawn, plane_radiance
@@ -31,6 +31,7 @@ from warpir.render.launches import (
     ReceiverLaunch,
     ReceiverRows,
     geometry_of,
+    launch_of_part,
     variant_of,
 )
 from warpir.render.shadow.pilot import dilate
@@ -256,9 +257,10 @@ class Renderer(Launcher):
         sharing: Sharing | None,
     ) -> Foreground:
         """Trace what `foreground` has set up."""
+        asked = spp
 
         def rows_of(rows: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
-            own = replace(launch, seed=pilot_seed(launch.seed, number))
+            own = launch_of_part(launch, number, spp / asked)
             lanes = self.lanes(len(rows), spp)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
@@ -357,12 +359,12 @@ class Renderer(Launcher):
         sharing: Sharing | None,
     ) -> ReceiverRadiance:
         """Trace what `receiver` has set up."""
-        stage, width = "shadow", self.scene.camera.width
+        stage, width, asked = "shadow", self.scene.camera.width, spp
         if camera_args is not None:
             stage, width = "shadow in another resolution", int(camera_args.width)
 
         def rows_of(chosen: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
-            own = replace(launch, seed=pilot_seed(launch.seed, number))
+            own = launch_of_part(launch, number, spp / asked)
             lanes = self.lanes(len(chosen), spp)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
