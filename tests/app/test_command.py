@@ -548,9 +548,9 @@ def test_config_file_yields_to_flags(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("asked", "size", "samples"),
     [
-        (None, (1280, 853), 40),
-        (None, (2000, 1500), 40),
-        (None, (4000, 1500), 20),
+        (None, (1280, 853), 32),
+        (None, (2000, 1500), 32),
+        (None, (2500, 1600), 24),
         (None, (4000, 3000), 16),
         (None, (20000, 10000), 16),
         (7, (4000, 3000), 7),

@@ -477,14 +477,14 @@ def test_more_samples_where_their_noise_would_be_seen(
 ) -> None:
     """Without ``--samples``; with it there are as many as asked for. The remedy names them."""
     monkeypatch.setattr("warpir.report.result.SEEN_NOISE", 1e-4)
-    for asked in (None, "40"):
+    for asked in (None, "32"):
         out = tmp_path / f"of-{asked}"
         changes = {"width": "384", "device": "cpu", "denoise": "off", "samples": asked}
         measured = go(arguments(inputs, out, **changes), out).record["measured"]
-        assert measured["samples"] == 40
+        assert measured["samples"] == 32
         taken = measured["mean_samples"]["object"]
-        assert 120.0 < taken <= 160.0 if asked is None else 36.0 < taken <= 40.0
-        of_remedy = 4 * max(40, round(taken))
+        assert 96.0 < taken <= 128.0 if asked is None else 28.0 < taken <= 32.0
+        of_remedy = 4 * max(32, round(taken))
         assert f"--samples {of_remedy}" in (out / "report.html").read_text()
 
 
@@ -504,8 +504,8 @@ def test_preview_of_a_large_photo_is_small(inputs: Path, tmp_path: Path, device:
         assert run.image("progress/preview-000000.png").shape == (576, 864, 3)
     else:
         assert not (run.out / "progress").exists()
-    assert run.record["measured"]["samples"] == 40
-    assert "--samples 160" in (run.out / "report.html").read_text()
+    assert run.record["measured"]["samples"] == 32
+    assert "--samples 128" in (run.out / "report.html").read_text()
 
 
 @pytest.mark.parametrize("change", ["replaced", "removed"])
