@@ -209,3 +209,22 @@ def test_limit_of_a_path_grows_with_a_pixels_samples() -> None:
     assert launch_of_part(launch, 0, 1.0) == launch
     pilot = launch_of_part(launch, 2, 0.125)
     assert pilot == replace(launch, seed=pilot.seed) and pilot.seed != launch.seed
+
+
+def test_parts_of_a_picture_have_their_limits(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has that of its samples; the pilots come before."""
+    monkeypatch.setattr(allocation, "LEAST_WORK", {"cpu": 0, "cuda": 0})
+    parts: list[tuple[int, float]] = []
+
+    def spied(launch: ObjectLaunch, number: int, share: float) -> ObjectLaunch:
+        parts.append((number, share))
+        return launch_of_part(launch, number, share)
+
+    monkeypatch.setattr("warpir.render.renderer.launch_of_part", spied)
+    renderer = metal(device)
+    pixels = renderer.gbuffer(0, 16).object_pixels
+    light = light_args(sun(), renderer.device)
+    renderer.foreground(light, pixels, 64, 1, 1, 0, 4.0, sharing=Sharing(as_it_is))
+    shares = [share for number, share in parts if number == 0]
+    assert [number for number, _ in parts[:2]] == [1, 2] and len(shares) == len(parts) - 2 > 1
+    assert shares == sorted(shares) and set(shares) <= {0.5, 1.0, 2.0, 4.0, 8.0}

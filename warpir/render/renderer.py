@@ -257,17 +257,16 @@ class Renderer(Launcher):
         sharing: Sharing | None,
     ) -> Foreground:
         """Trace what `foreground` has set up."""
-        asked = spp
 
-        def rows_of(rows: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
-            own = launch_of_part(launch, number, spp / asked)
-            lanes = self.lanes(len(rows), spp)
+        def rows_of(rows: IntArray, count: int, number: int) -> tuple[FloatArray, ...]:
+            own = launch_of_part(launch, number, count / spp)
+            lanes = self.lanes(len(rows), count)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
                 # As many lanes as all rows have together: sums keep their order.
                 first, last = start * lanes, stop * lanes
                 cut = (r if r is None else Rows(r).cut(first, last) for r in records)
-                return own.sums(self, pixels[rows[start:stop]], spp, lanes, *cut)
+                return own.sums(self, pixels[rows[start:stop]], count, lanes, *cut)
 
             return self._in_chunks(trace, len(rows), "object")
 
@@ -359,18 +358,18 @@ class Renderer(Launcher):
         sharing: Sharing | None,
     ) -> ReceiverRadiance:
         """Trace what `receiver` has set up."""
-        stage, width, asked = "shadow", self.scene.camera.width, spp
+        stage, width = "shadow", self.scene.camera.width
         if camera_args is not None:
             stage, width = "shadow in another resolution", int(camera_args.width)
 
-        def rows_of(chosen: IntArray, spp: int, number: int) -> tuple[FloatArray, ...]:
-            own = launch_of_part(launch, number, spp / asked)
-            lanes = self.lanes(len(chosen), spp)
+        def rows_of(chosen: IntArray, count: int, number: int) -> tuple[FloatArray, ...]:
+            own = launch_of_part(launch, number, count / spp)
+            lanes = self.lanes(len(chosen), count)
 
             def trace(start: int, stop: int) -> tuple[FloatArray, ...]:
                 first, last = start * lanes, stop * lanes
                 cut = (r if r is None else Rows(r).cut(first, last) for r in records)
-                return own.sums(self, rows.at(chosen[start:stop]), spp, lanes, *cut)
+                return own.sums(self, rows.at(chosen[start:stop]), count, lanes, *cut)
 
             traced = self._in_chunks(trace, len(chosen), stage)
             if number:
