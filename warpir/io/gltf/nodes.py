@@ -1,11 +1,11 @@
 """The scene graph of glTF: which nodes are drawn, and where their transforms put them."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warpir.core.arrays import Float64Array, affine_matrix
+from warpir.core.arrays import Float64Array
 from warpir.core.limits import Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.meshes.triangles import EXTENT
@@ -81,33 +81,39 @@ def local_matrix(node: Entry) -> Float64Array:
     )
 
 
-def from_trs(
-    translation: Sequence[float], rotation: Sequence[float], scale: Sequence[float]
-) -> Float64Array:
-    """Return translation * rotation * scale as a matrix, shape [4, 4].
+def from_trs(translation: ArrayLike, rotation: ArrayLike, scale: ArrayLike) -> Float64Array:
+    """Return translation * rotation * scale as matrices, shape [..., 4, 4].
 
-    The translation is in metres, the rotation a quaternion x, y, z, w of any length but 0.
+    Translations [m] and scales have shape [..., 3]; rotations are quaternions x, y, z, w of any
+    length but 0, shape [..., 4].
     """
-    length = math.hypot(*rotation)
-    x, y, z, w = (component / length for component in rotation)
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    turn = np.asarray(rotation, np.float64)
+    turn = turn / np.abs(turn).max(axis=-1, keepdims=True)  # else squares may overflow
+    x, y, z, w = np.moveaxis(turn / np.linalg.norm(turn, axis=-1, keepdims=True), -1, 0)
+    columns = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
+        [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
+        [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return affine_matrix(np.array(turn) * scale, translation)
+    matrices = np.zeros((*turn.shape[:-1], 4, 4))
+    for column, axis in enumerate(columns):
+        share = np.asarray(scale, np.float64)[..., column, None]
+        matrices[..., :3, column] = np.stack(axis, axis=-1) * share
+    matrices[..., :3, 3] = translation
+    matrices[..., 3, 3] = 1.0
+    return matrices
 
 
-def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Float64Array]:
-    """Return the matrices at which a node's mesh stands, shape [4, 4] each.
+def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> Float64Array:
+    """Return the matrices at which a node's mesh stands, shape [instance, 4, 4].
 
     One, or as many as EXT_mesh_gpu_instancing lists below the node.
     """
     extension = node.extension("EXT_mesh_gpu_instancing")
     if extension is None:
-        return [world]
+        return world[None]
     attributes = extension.child("attributes")
-    read: dict[str, list[list[float]]] = {}
+    read: dict[str, Float64Array] = {}
     for name, kind in {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}.items():
         if name in attributes:
             accessor = attributes.integer(name)
@@ -117,20 +123,20 @@ def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> list[Flo
             stored = file.accessor(accessor, attributes, name, (kind,))
             if stored.dtype.kind != "f":
                 raise attributes.error("component_type", what=f"{name} is")
-            read[name] = stored.tolist()
+            read[name] = stored.astype(np.float64)
     counts = {name: len(values) for name, values in read.items()}
     if len(set(counts.values())) != 1:
         found = ", ".join(f"{count} {name}" for name, count in counts.items()) or "no"
         what, limit = "of the attributes", "equally many"
         raise attributes.error("count", found=found, what=what, limit=limit, of="are expected")
     (count,) = set(counts.values())
-    rotations = read.get("ROTATION", [[0.0, 0.0, 0.0, 1.0]] * count)
-    if any(math.hypot(*rotation) < 1e-6 for rotation in rotations):
+    shifts = read.get("TRANSLATION", np.zeros((count, 3)))
+    rotations = read.get("ROTATION", np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+    scales = read.get("SCALE", np.ones((count, 3)))
+    if (np.linalg.norm(rotations, axis=-1) < 1e-6).any():
         raise attributes.error("matrix", what="ROTATION holds the zero quaternion")
-    shifts = read.get("TRANSLATION", [[0.0] * 3] * count)
-    scales = read.get("SCALE", [[1.0] * 3] * count)
     with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
-        return [world @ from_trs(*parts) for parts in zip(shifts, rotations, scales, strict=True)]
+        return np.asarray(world @ from_trs(shifts, rotations, scales))
 
 
 class Skins:
@@ -188,11 +194,16 @@ class Skins:
         return self._worlds[joint]
 
 
-def check_invertible(node: Entry, world: Float64Array, which: str) -> None:
-    """Refuse a transform that flattens the mesh or overflows."""
-    linear = world[:3, :3]
-    if not (np.abs(world) < EXTENT).all():
+def check_invertible(node: Entry, placed: Float64Array) -> None:
+    """Refuse a transform that flattens the mesh or overflows, of one instance [instance, 4, 4]."""
+    linear = placed[:, :3, :3]
+    is_small = (np.abs(placed) < EXTENT).all(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        volume = np.linalg.norm(linear, axis=1).prod(axis=-1)
+        is_flat = np.abs(np.linalg.det(linear)) <= 1e-9 * volume
+    refused = np.flatnonzero(~is_small | is_flat)
+    if refused.size:
+        which = f" of instance {refused[0]}" if len(placed) > 1 else ""
+        if is_small[refused[0]]:
+            raise node.error("singular", what=f"transform{which}")
         raise node.error("transform_too_large", what=f"transform{which}", limit=EXTENT)
-    volume = np.linalg.norm(linear, axis=0).prod()
-    if abs(np.linalg.det(linear)) <= 1e-9 * volume:
-        raise node.error("singular", what=f"transform{which}")

@@ -160,9 +160,8 @@ def placed_primitives(file: GltfFile, notices: list[str]) -> Iterator[Placed]:
         if joints is None and not world[:3, :3].any():
             notices.append(f"{node.pointer}: scaled to nothing, which hides it")
             continue
-        instances = [np.eye(4)] if joints is not None else read_instances(file, node, world)
-        for number, matrix in enumerate(instances):
-            check_invertible(node, matrix, f" of instance {number}" if len(instances) > 1 else "")
+        instances = np.eye(4)[None] if joints is not None else read_instances(file, node, world)
+        check_invertible(node, instances)
         if joints is not None:
             notices.append(f"{node.pointer}: skinned, stands as its joints do in the file")
         mesh = root.item("meshes", node.integer("mesh"), node, "mesh")
