@@ -121,7 +121,7 @@ def tone_curve_cube(knots: ToneKnots, about: str) -> bytes:
         f"LUT_1D_SIZE {CUBE_SIZE}",
         "DOMAIN_MIN 0.0 0.0 0.0",
         "DOMAIN_MAX 1.0 1.0 1.0",
-        *(f"{r:.8f} {g:.8f} {b:.8f}" for r, g, b in table),
+        *(f"{r:.8f} {g:.8f} {b:.8f}" for r, g, b in table.tolist()),
     ]
     return ("\n".join(lines) + "\n").encode()
 

@@ -7,11 +7,12 @@ quarter +X, and texel centres lie at +0.5. For a direction (x, y, z) the horizon
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from warpir.core.arrays import AnyFloatArray, Float64Array, FloatArray
+
+ROWS_AT_ONCE = 8
+"""Rows of a map that `resize_map` makes at once."""
 
 
 def longitudes(width: int) -> Float64Array:
@@ -145,12 +146,14 @@ def resize_map(texels: FloatArray, height: int) -> FloatArray:
     def boxes(values: AnyFloatArray, old: Float64Array, new: Float64Array) -> Float64Array:
         """Average rows between rising ``old`` edges over rising ``new`` ones."""
         averaged = np.empty((len(new) - 1, *values.shape[1:]))
-        # One row at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.
-        for k, (low, high) in enumerate(pairwise(new)):
-            first = max(int(np.searchsorted(old, low, side="right")) - 1, 0)
-            last = max(int(np.searchsorted(old, high, side="left")), first + 1)
-            share = np.diff(np.clip(old[first : last + 1], low, high)) / (high - low)
-            averaged[k] = np.tensordot(share, values[first:last], axes=1)
+        # Some rows at a time: a float64 copy of an 8k map and its running sum would take 3 GiB.
+        for start in range(0, len(averaged), ROWS_AT_ONCE):
+            edges = new[start : start + ROWS_AT_ONCE + 1]
+            first = max(int(np.searchsorted(old, edges[0], side="right")) - 1, 0)
+            last = max(int(np.searchsorted(old, edges[-1], side="left")), first + 1)
+            reached = np.clip(old[None, first : last + 1], edges[:-1, None], edges[1:, None])
+            share = np.diff(reached, axis=1) / np.diff(edges)[:, None]
+            averaged[start : start + len(share)] = np.tensordot(share, values[first:last], axes=1)
         return averaged
 
     if texels.shape[0] == height and texels.shape[1] == 2 * height:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpir.core.arrays import CodeArray
+from warpir.core.arrays import CodeArray, FloatArray
 from warpir.core.color import linear_to_gamma
-from warpir.core.latlong import map_directions, texel_solid_angles, uv_of
+from warpir.core.latlong import look_up, map_directions, texel_solid_angles, uv_of
 from warpir.scene.camera import Camera
 from warpir.scene.light import Light, as_map
 
@@ -34,16 +34,20 @@ def balls(light: Light, camera: Camera, is_reinhard: bool) -> CodeArray:
     column = (u * sharp.shape[1]).astype(int) % sharp.shape[1]
     row = np.minimum(v * sharp.shape[0], sharp.shape[0] - 1).astype(int)
     mirror = sharp[row, column].astype(np.float64)
-    weighted = as_map(light, 32) * texel_solid_angles(32, 64)[:, None, None] * GREY_BALL / np.pi
-    flux = weighted.reshape(-1, 3).astype(np.float32)
-    toward = map_directions(32, 64).reshape(-1, 3).T.astype(np.float32)
-    diffuse = np.zeros_like(mirror)
-    # One row at a time: the cosines of all pixels with all texels would take gigabytes.
-    for row, facing, seen in zip(diffuse, normal.astype(np.float32), inside, strict=True):
-        row[seen] = np.maximum(facing[seen] @ toward, 0.0) @ flux
+    diffuse = look_up(_lit(light), normal)
     pair = []
     for ball in (mirror, diffuse):
         shown = ball / (1.0 + ball) if is_reinhard else np.minimum(ball, 1.0)
         shown = np.where(inside[..., None], shown, 0.03)
         pair.append(linear_to_gamma(shown))
     return np.round(np.concatenate(pair, axis=1) * 255.0).astype(np.uint8)
+
+
+def _lit(light: Light) -> FloatArray:
+    """Return the radiance of a grey surface by its normal, a map of shape [48, 96, 3]."""
+    weighted = as_map(light, 32) * texel_solid_angles(32, 64)[:, None, None] * GREY_BALL / np.pi
+    flux = weighted.reshape(-1, 3).astype(np.float32)
+    toward = map_directions(32, 64).reshape(-1, 3).T.astype(np.float32)
+    # One row at a time: the cosines of all normals with all texels would take 36 MB.
+    facing = map_directions(48, 96).astype(np.float32)
+    return np.stack([np.maximum(row @ toward, 0.0) @ flux for row in facing])
