@@ -2,7 +2,8 @@
 # it, later calls find the stamp and go straight on. PYTHON chooses the interpreter (3.11 or newer).
 PYTHON ?= python3
 # Processes that share the tests; each computes with one thread, for torch's threads wait by spinning
-# and made some tests ten times as slow beside another process, and takes up to 3 GB.
+# and made some tests ten times as slow beside another process, and takes up to 3 GB. Compiled modules
+# are kept even where the environment says otherwise: else each process compiles the tests for 24 s.
 WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +15,7 @@ demo: $(STAMP)
 	$(BIN)/python -m warpir.insert --demo --out out/demo --overwrite
 
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow" -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -4,10 +4,19 @@ import hashlib
 import time
 
 import pytest
+from _pytest.mark import ParameterSet
 
 from tests.cases import cases_of
 
 NO_TIME = "no time is left for it"
+
+
+def slow(*values: object) -> list[ParameterSet]:
+    """Return a parameter's values with which a test is slow, beside others: ``[1, *slow(2, 3)]``.
+
+    For tests that take seconds with each value, and of which one tells nearly as much as all.
+    """
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
 
 
 class SlowTests:

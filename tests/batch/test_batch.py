@@ -192,6 +192,7 @@ assert loaded() == before, loaded() ^ before
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_left_for_workers_to_compile(memory: Path) -> None:
     """What is compiled before they start is all that a scene loads."""
     argv = [*arguments(memory, memory / "out", samples="1", depth="1"), *FLAGS]

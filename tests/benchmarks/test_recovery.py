@@ -29,6 +29,7 @@ from benchmarks.light.recovery import (
 from benchmarks.speed.scenes import standing_ball
 from tests import oracles as o
 from tests.builders.shapes import box
+from tests.slow import slow
 from warpir.app.settings import OptimizeSettings
 from warpir.core.arrays import FloatArray
 from warpir.core.latlong import resize_map
@@ -102,7 +103,7 @@ def tone_error_of_identity(contrast: float) -> float:
 # ----------------------------------------------------------------------------- the measures
 
 
-@pytest.mark.parametrize("sigma", [0.005, 0.05, 0.1])
+@pytest.mark.parametrize("sigma", [0.005, *slow(0.05, 0.1)])
 @pytest.mark.parametrize("angles", [(50.0, 35.0), (-170.0, 8.0), (90.0, 85.0)])
 def test_brightest_direction_finds_the_sun(sigma: float, angles: tuple[float, float]) -> None:
     """From a point to six degrees, low and high, to a tenth of the map's texels."""

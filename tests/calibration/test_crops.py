@@ -124,6 +124,7 @@ def test_sharpness_does_not_tell_the_field_of_view() -> None:
     assert changes == pytest.approx([changes[0]] * 3, rel=0.15)
 
 
+@pytest.mark.slow
 def test_training_writes_weights_that_are_calibrated(tmp_path: Path) -> None:
     small = CalibratorConfig(channels=(8, 8, 16), blocks=(1, 1), depth=1, heads=2)
     found = train_camera(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 import warpir.diffusion.personalization.personalize as module
 from tests.builders.tiny_stable_diffusion import make_tiny_stable_diffusion
+from tests.slow import slow
 from warpir.core.cache import take_notices
 from warpir.diffusion.models.loading import load_stable_diffusion
 from warpir.diffusion.models.model_error import ModelError
@@ -421,7 +422,13 @@ def test_the_same_seed_gives_the_same_bytes(epsilon: StableDiffusion) -> None:
 
 
 @pytest.mark.parametrize(
-    ("prior", "stop"), [("epsilon", 1), ("v_prediction", 4), ("epsilon", 6)], indirect=["prior"]
+    ("prior", "stop"),
+    [
+        ("v_prediction", 4),
+        pytest.param("epsilon", 1, marks=pytest.mark.slow),
+        pytest.param("epsilon", 6, marks=pytest.mark.slow),
+    ],
+    indirect=["prior"],
 )
 def test_a_resumed_training_ends_with_the_same_bytes(
     prior: StableDiffusion, folders: dict[str, Path], stop: int
@@ -541,7 +548,7 @@ def test_an_earlier_lora_of_the_same_photo_is_found(
     assert torch.equal(predictions(fresh, "other"), expected)
 
 
-@pytest.mark.parametrize("change", ["photo", "prompt", "settings", "seed", "model"])
+@pytest.mark.parametrize("change", ["photo", "model", *slow("prompt", "settings", "seed")])
 def test_what_a_lora_depends_on_is_in_its_key(
     loaded: dict[str, StableDiffusion], tmp_path: Path, change: str
 ) -> None:
@@ -563,7 +570,7 @@ def test_what_a_lora_depends_on_is_in_its_key(
     assert not personalize(prior, photo, prompts, settings, seed, tmp_path).is_reused
 
 
-@pytest.mark.parametrize("fault", ["cut", "junk", "one bit"])
+@pytest.mark.parametrize("fault", ["one bit", *slow("cut", "junk")])
 def test_a_damaged_lora_is_trained_again(
     epsilon: StableDiffusion, tmp_path: Path, fault: str
 ) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests import oracles
+from tests.slow import slow
 from warpir.core.latlong import map_directions, rotate_map
 from warpir.evaluate import three_spheres
 from warpir.evaluate.three_spheres import (
@@ -81,7 +82,7 @@ def test_response_is_the_glTF_brdf_times_cosine(name: str, rng: np.random.Genera
     assert np.allclose(found, f * np.maximum(wi[:, 2], 0.0), rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["diffuse", "matte"])
+@pytest.mark.parametrize("name", ["diffuse", *slow("matte")])
 def test_white_furnace_gives_the_directional_albedo(name: str) -> None:
     """A sphere in a constant light shows the albedo at each angle; it is bounded by it."""
     material = MATERIALS[name]

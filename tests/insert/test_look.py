@@ -20,6 +20,7 @@ from tests.builders.insertions import (
 )
 from tests.builders.outcome import outcome
 from tests.look.test_toning import TONES, a_scene
+from tests.slow import slow
 from warpir.core.color import GAMMA, luminance
 from warpir.look.camera_look import CameraLook
 
@@ -83,7 +84,7 @@ def test_all_off_gives_the_bytes_of_a_run_without_the_stage(
     assert (codes != auto.image()).any(axis=-1).sum() > 500
 
 
-@pytest.mark.parametrize("kind", ["png", "jpg", "p3.png"])
+@pytest.mark.parametrize("kind", ["png", *slow("jpg", "p3.png")])
 def test_black_and_white_photo_has_a_grey_object(
     inputs: Path, tmp_path: Path, device: str, kind: str
 ) -> None:
@@ -111,6 +112,7 @@ def test_black_and_white_photo_has_a_grey_object(
     assert np.ptp(colored_run.image().astype(int), axis=-1).max() > 20
 
 
+@pytest.mark.slow
 def test_toned_photo_has_a_toned_object(inputs: Path, tmp_path: Path, device: str) -> None:
     """All of the picture lies on the photo's curve, unless the object's colours are asked for."""
     photo = tmp_path / "photo.png"

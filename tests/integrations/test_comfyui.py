@@ -91,6 +91,7 @@ def test_example_fits_the_nodes(nodes: ModuleType) -> None:
                 assert returned[value[1]] == stated[name][0]
 
 
+@pytest.mark.slow
 def test_camera_and_light_are_estimated(nodes: ModuleType) -> None:
     import warpir.demo
 

@@ -186,6 +186,7 @@ def test_handoff_takes_no_code_from_names(folder: Path, tmp_path: Path, place: i
     )
 
 
+@pytest.mark.slow
 @pytest.mark.case("I19")
 def test_handoff_carries_nothing_of_the_photo_but_its_pixels(folder: Path, tmp_path: Path) -> None:
     """No EXIF, GPS, XMP, text or comment of any photo, in no file; no folder but in run.json.

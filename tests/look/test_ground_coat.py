@@ -9,6 +9,7 @@ from PIL import Image
 
 from tests.builders.shapes import view_rays
 from tests.oracles import fresnel
+from tests.slow import slow
 from warpir.core.arrays import BoolArray, Float64Array
 from warpir.core.color import gamma_to_linear
 from warpir.demo import CAMERA, PHOTO, WET_PHOTO, WET_ROUGHNESS
@@ -82,7 +83,7 @@ def scene(
     return np.repeat(photo[..., None], 3, axis=-1), camera
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("roughness", [0.2, *slow(0.1, 0.3)])
 def test_roughness_of_a_coat_that_is_known(roughness: float) -> None:
     """The roughness is the coat's within 0.04 under slabs of uneven brightness."""
     found = estimate_coat(*scene(stripes(1), roughness), UP)
@@ -91,7 +92,7 @@ def test_roughness_of_a_coat_that_is_known(roughness: float) -> None:
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.5])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, *slow(2)])
 def test_strength_is_told_over_fresnels(seed: int, strength: float) -> None:
     """On an even ground, of a coat whose lobe is wider than the steps of the distances tried."""
     found = estimate_coat(*scene(stripes(seed), 0.2, strength, texture=0.0), UP)
@@ -99,6 +100,7 @@ def test_strength_is_told_over_fresnels(seed: int, strength: float) -> None:
     assert found.explained > 0.6
 
 
+@pytest.mark.slow
 def test_turned_camera_and_enlarged_photo_tell_the_same() -> None:
     """Azimuth counts from where the camera looks, and angles, not pixels."""
     photo, camera = scene(stripes(1), 0.2)
@@ -113,7 +115,7 @@ def test_turned_camera_and_enlarged_photo_tell_the_same() -> None:
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.1, 1.0])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *slow(1, 2)])
 def test_matt_ground_has_no_coat(seed: int, texture: float) -> None:
     """Neither an even ground nor slabs of any contrast are taken for a mirror."""
     found = estimate_coat(*scene(stripes(seed), None, texture=texture), UP)

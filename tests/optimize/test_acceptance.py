@@ -78,6 +78,7 @@ def test_a_way_toward_the_truth_is_accepted_and_one_away_is_not() -> None:
     assert wrong.is_accepted == bool(nearer)
 
 
+@pytest.mark.slow
 def test_pure_noise_is_refused_nineteen_times_in_twenty() -> None:
     """Student's distribution of 16 draws puts 6 % beyond 1.64; 400 trials scatter by 1.2 %."""
     start, end = picture(1), picture(2)

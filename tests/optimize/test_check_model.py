@@ -73,6 +73,7 @@ def test_random_weights_are_not_a_trained_model(
     assert 0.0 < found["seconds"]["lora_step"] and 0.0 < found["seconds"]["guidance_step"]
 
 
+@pytest.mark.slow
 def test_a_trained_model_passes(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

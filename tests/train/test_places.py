@@ -106,6 +106,7 @@ def test_joined_networks_answer_with_the_mean_and_its_doubt(tmp_path: Path) -> N
     torch.testing.assert_close(both.level_log_var, variance.log(), atol=1e-2, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_the_means_temperature_is_set_by_a_folder_of_places(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -24,6 +24,7 @@ from tests.render.test_transport import (
     ratios_of,
     scene_of,
 )
+from tests.slow import slow
 from warpir.core.arrays import Float64Array
 from warpir.io.images.writers import exr_bytes
 from warpir.render.device_light import light_args
@@ -105,7 +106,7 @@ def test_bounce_of_a_mirror_gives_back_what_it_hides(device: str) -> None:
     assert_zero(found.thrown - found.blocked)
 
 
-@pytest.mark.parametrize("normal", [(0.0, 1.0, 0.0), (0.2, 1.0, 0.15)])
+@pytest.mark.parametrize("normal", [(0.2, 1.0, 0.15), *slow((0.0, 1.0, 0.0))])
 def test_bounce_of_what_glows(device: str, normal: tuple[float, float, float]) -> None:
     """In darkness each point of the ground gets the object's radiance times what it covers."""
     glow = np.array([2.0, 1.0, 0.5])
@@ -117,7 +118,7 @@ def test_bounce_of_what_glows(device: str, normal: tuple[float, float, float]) -
     assert_zero(found.thrown - glow * sky.blocked)
 
 
-@pytest.mark.parametrize("sunk", [0.45, 0.9])
+@pytest.mark.parametrize("sunk", [0.45, *slow(0.9)])
 def test_bounce_of_what_is_sunk_is_that_of_what_stands_out(device: str, sunk: float) -> None:
     """The ground sees the part above it alone: no light that is thrown or blocked is missed."""
     standing = 1.0 - sunk
@@ -132,6 +133,7 @@ def test_bounce_of_what_is_sunk_is_that_of_what_stands_out(device: str, sunk: fl
     assert_zero(whole.blocked - upper.blocked)
 
 
+@pytest.mark.slow
 def test_bounce_of_a_sunlit_wall_exceeds_one(device: str) -> None:
     """Before a Lambert wall in the sun the ground gains; behind it, in its shadow, nothing."""
     axis, sharpness = np.array([0.2, 0.45, 0.9]), 300.0
@@ -172,6 +174,7 @@ def test_bounce_leaves_the_contact_dark(device: str) -> None:
     assert (found.unoccluded > 0.5).all() and ratio.max() < 0.02, ratio
 
 
+@pytest.mark.slow
 def test_bounce_onto_a_mesh_is_that_onto_the_plane(device: str) -> None:
     """A dark floor of two triangles gains what the plane in its place gains."""
     floor = quad((0.0, 0.0, -4.0), (60.0, 0.0, 0.0), (0.0, 0.0, -60.0))
@@ -252,6 +255,7 @@ def test_bounce_of_transport_adds_what_glows(device: str) -> None:
     assert float(own.lit.sum()) == pytest.approx(float(truth.lit.sum()), rel=0.02)
 
 
+@pytest.mark.slow
 def test_light_on_ground_of_a_plate_does_not_depend_on_its_unit(tmp_path: Path) -> None:
     """In numbers 1000 times as large, a plate keeps what the object throws and reflects."""
     write_inputs(tmp_path)
