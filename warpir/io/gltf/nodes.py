@@ -1,14 +1,17 @@
 """The scene graph of glTF: which nodes are drawn, and where their transforms put them."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from warpir.core.arrays import Float64Array
 from warpir.core.limits import Limits
 from warpir.io.gltf.gate import Entry, GltfFile
 from warpir.io.meshes.triangles import EXTENT
+
+Components = Sequence[float] | Float64Array
+"""Numbers, or the rows of an array whose columns are instances."""
 
 
 def read_forest(root: Entry, limits: Limits) -> tuple[list[Entry], dict[int, int]]:
@@ -81,25 +84,27 @@ def local_matrix(node: Entry) -> Float64Array:
     )
 
 
-def from_trs(translation: ArrayLike, rotation: ArrayLike, scale: ArrayLike) -> Float64Array:
+def from_trs(translation: Components, rotation: Components, scale: Components) -> Float64Array:
     """Return translation * rotation * scale as matrices, shape [..., 4, 4].
 
-    Translations [m] and scales have shape [..., 3]; rotations are quaternions x, y, z, w of any
-    length but 0, shape [..., 4].
+    Args:
+        translation: x, y and z [m], numbers or shape [...] each.
+        rotation: Quaternions x, y, z and w of any length but 0.
+        scale: Along x, y and z.
     """
-    turn = np.asarray(rotation, np.float64)
-    turn = turn / np.abs(turn).max(axis=-1, keepdims=True)  # else squares may overflow
-    x, y, z, w = np.moveaxis(turn / np.linalg.norm(turn, axis=-1, keepdims=True), -1, 0)
+    largest = sum(abs(component) for component in rotation)
+    x, y, z, w = (component / largest for component in rotation)  # whose squares cannot overflow
+    length = (x * x + y * y + z * z + w * w) ** 0.5
+    x, y, z, w = x / length, y / length, z / length, w / length
+    a, b, c = scale
     columns = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
-        [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
-        [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
+        [a * (1 - 2 * (y * y + z * z)), a * 2 * (x * y + z * w), a * 2 * (x * z - y * w)],
+        [b * 2 * (x * y - z * w), b * (1 - 2 * (x * x + z * z)), b * 2 * (y * z + x * w)],
+        [c * 2 * (x * z + y * w), c * 2 * (y * z - x * w), c * (1 - 2 * (x * x + y * y))],
+        [*translation],
     ]
-    matrices = np.zeros((*turn.shape[:-1], 4, 4))
-    for column, axis in enumerate(columns):
-        share = np.asarray(scale, np.float64)[..., column, None]
-        matrices[..., :3, column] = np.stack(axis, axis=-1) * share
-    matrices[..., :3, 3] = translation
+    matrices = np.zeros((*np.shape(x), 4, 4))
+    matrices[..., :3, :] = np.array(columns).T
     matrices[..., 3, 3] = 1.0
     return matrices
 
@@ -136,7 +141,7 @@ def read_instances(file: GltfFile, node: Entry, world: Float64Array) -> Float64A
     if (np.linalg.norm(rotations, axis=-1) < 1e-6).any():
         raise attributes.error("matrix", what="ROTATION holds the zero quaternion")
     with np.errstate(over="ignore", invalid="ignore"):  # `check_invertible` refuses such sizes
-        return np.asarray(world @ from_trs(shifts, rotations, scales))
+        return np.asarray(world @ from_trs(shifts.T, rotations.T, scales.T))
 
 
 class Skins:
