@@ -202,7 +202,7 @@ class Skins:
 def check_invertible(node: Entry, placed: Float64Array) -> None:
     """Refuse a transform that flattens the mesh or overflows, of one instance [instance, 4, 4]."""
     linear = placed[:, :3, :3]
-    is_small = (np.abs(placed) < EXTENT).all(axis=(1, 2))
+    is_small = np.abs(placed).max(axis=(1, 2)) < EXTENT
     with np.errstate(over="ignore", invalid="ignore"):
         volume = np.linalg.norm(linear, axis=1).prod(axis=-1)
         is_flat = np.abs(np.linalg.det(linear)) <= 1e-9 * volume
