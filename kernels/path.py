@@ -334,9 +334,9 @@ def foreground_kernel(
                 with other materials, and `GLASS_DEPTH` in all at most.
             candidates: Directions of the light among which the object's first vertex picks one
                 (`sample_emitter`); 1 with a record.
-            indirect_limit: Most radiance that one path may add behind its first vertex; 0 for no
-                limit. It takes the fireflies of light that a mirror throws onto a matte surface,
-                and with them some of that light.
+            indirect_limit: Most radiance that each vertex behind the first may add to a path, by
+                its largest channel, emission apart; 0 for no limit. It takes the fireflies of light
+                that a mirror throws onto a matte surface, and with them some of that light.
             seed: Base seed.
             ground_alpha: GGX alpha of the ground's coat; only the mirror looks at it.
             foreground: Radiance premultiplied by coverage, shape [row].

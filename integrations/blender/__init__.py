@@ -30,7 +30,7 @@ class Preferences(bpy.types.AddonPreferences):
 class Settings(bpy.types.PropertyGroup):
     """A scene's; ``light`` is the folder of the last estimate, ``result`` of the last run."""
 
-    samples: IntProperty(name="Samples", description="Per pixel", default=64, min=1, max=4096)
+    samples: IntProperty(name="Samples", description="Per pixel; 0: 32 or so", min=0, max=4096)
     estimate_flags: StringProperty(
         name="Flags of the estimate",
         description=FLAGS.format("estimate", "--fov 50 --camera-height 1.2"),

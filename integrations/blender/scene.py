@@ -103,7 +103,9 @@ def insert_arguments(context: Any, folder: Path) -> list[str]:
     place = f"{middle[0]:.9g},{low[2]:.9g},{-middle[1]:.9g}"
     command = ["-m", "warpir.insert", "--photo", str(photo), "--asset", str(asset)]
     command += ["--camera", str(camera), f"--place={place}", f"--ground=0,1,0,{-low[2]:.9g}"]
-    command += ["--samples", str(settings.samples), "--out", str(folder / "result")]
+    command += ["--out", str(folder / "result")]
+    if settings.samples:  # else as many as the command line chooses
+        command += ["--samples", str(settings.samples)]
     if settings.light_of == str(photo) and Path(settings.light, "run.json").is_file():
         command += ["--reuse", settings.light]
     return [*command, *shlex.split(settings.flags)]

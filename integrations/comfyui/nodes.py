@@ -184,7 +184,7 @@ class InsertObject:
                 "occluder": ("MASK", {"tooltip": "What stands in front of the object"}),
                 "model": text("A folder of Stable Diffusion that guides the light; empty: none"),
                 "prompt": text("What the object is, in a few words; with a model"),
-                "samples": ("INT", {"default": 64, "min": 1, "max": 4096, "tooltip": "Per pixel"}),
+                "samples": ("INT", {"default": 0, "min": 0, "max": 4096, "tooltip": "0: auto"}),
                 "seed": ("INT", {"default": 0, "min": 0, "max": 2**31 - 1, "tooltip": "Of noise"}),
             },
         }

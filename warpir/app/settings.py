@@ -200,17 +200,17 @@ class RenderConfig:
     """How the picture is rendered, and on what."""
 
     samples: int | None = option(None, "N", low=1, high=2**20)
-    """Mean samples per pixel, more where noise is (default: 32); without it a small object
-    has up to four times as many if their noise would be seen, and above 3 megapixels there are the
-    fewer, the more pixels share what is seen, down to 16"""
+    """Samples per pixel (default: 32, above 3 megapixels fewer, down to 16); from 32 on a mean, on
+    the CPU more where noise is; there a small object has by default up to four times as many, if
+    their noise would be seen"""
     rays: int = option(1, "N", low=1, high=2**10)
     """Rays per sample, of light and of surface each"""
     depth: int = option(5, "D", low=1, high=2**10)
     """Longest light path, in surface hits"""
     indirect_limit: float = option(4.0, "RADIANCE", low=0)
-    """Most radiance after a path's first bounce (0: any); that is in a pixel of --samples, more in
-    one that gets more; the limit, lower for what is thrown onto dark ground and higher on a linear
-    plate whose white is above 1, removes bright specks where a mirror throws sunlight"""
+    """Most radiance of each bounce but the first (0: any); that is in a pixel of --samples, more in
+    one that gets more; the limit, a quarter or less for what is thrown onto the ground and
+    more on a linear plate of white above 1, removes specks where a mirror throws sunlight"""
     bounce: bool = option(True, expert=True)
     """Let the object throw light on the ground; what it reflects and emits there is in the shadow
     ratio, which --no-bounce leaves to what the object blocks, as DiPIR does"""
@@ -219,7 +219,7 @@ class RenderConfig:
     )
     """Let the ground mirror the object, as wet asphalt, tiles and lacquer do; its roughness, 0 is a
     mirror; auto: estimated where the photo shows mirror images on the ground, else off; for a plane
-    as ground, and in the picture alone: neither guidance nor preview has it"""
+    as ground, in the picture and its first preview; guidance does without it"""
     denoise: str = option("auto", "auto|off", expert=True, choices=("auto", "off"))
     """Take the renderer's noise out of object and shadow; auto: where pyoidn is installed (pip
     install warpir[denoise])"""
@@ -416,7 +416,7 @@ class OutputConfig:
     mitsuba: bool = option(False)
     """Write a scene of Mitsuba 3 as well; the insertion, into a folder of its own"""
     usd: bool = option(False)
-    """Write scene.usdz for OpenUSD as well; object, light and camera (pip install 'warpir[usd]')"""
+    """Write scene.usdz for OpenUSD as well; object, lights, camera (pip install 'warpir[usd]')"""
 
     @property
     def folder(self) -> Path:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from warpir.lighting.scene_light import SceneLight
     from warpir.render.renderer import Renderer
 
-PREVIEW_SAMPLES, PREVIEW_DEPTH, PREVIEW_LIMIT = 12, 3, 8.0
+PREVIEW_SAMPLES, PREVIEW_DEPTH, PREVIEW_LIMIT = 12, 3, 4.0
 """Samples per pixel, longest light path, and most radiance after its first bounce of a preview."""
 PREVIEW_ROWS = 160
 """Rows of its map of what the photo shows of the surroundings."""

@@ -217,8 +217,8 @@ what is expected of all as its control variate. Seconds times squared error on t
 of that of four without it on a matte ball, and two thirds on a metal one. Sixteen gain a fifth on
 the ball and lose as much on an object in its own shadow."""
 THROWN_LIMIT = 0.25
-"""Of `ReceiverLaunch.indirect_limit`, for light on the ground: there 64 samples of a path of
-radiance 8 leave a speck of a tenth, and the whole bounce is a few hundredths."""
+"""Of `ReceiverLaunch.indirect_limit`, for light on the ground: there ten samples, a third of 32, of
+a path of radiance 1 leave a speck of a tenth, and the whole bounce is a few hundredths."""
 THROWN_SHARE = 3
 """Samples of the receiver for one of the light that the object throws there: with as many it takes
 three fifths of the time and holds a seventh of the squared error. Not in blocks of pixels, where

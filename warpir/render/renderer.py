@@ -1,8 +1,8 @@
 """Renderer of the object's G-buffer, its radiance and the shadow ratio.
 
-Pure Warp, no torch. A pixel's numbers depend on (seed, pixel, sample) alone. Pixels that do not fit
-into memory at once are traced in two halves (`warpir.core.memory`), those whose radiance is not
-finite are black (`warpir.render.bad_pixels`).
+Pure Warp, no torch. A pixel's numbers depend on seed, pixel and number of samples alone, but where
+noise shares these out. Pixels that do not fit into memory at once are traced in two halves
+(`warpir.core.memory`), those whose radiance is not finite are black (`warpir.render.bad_pixels`).
 """
 
 from __future__ import annotations
@@ -228,15 +228,15 @@ class Renderer(Launcher):
             rays: Paths per camera sample, each with one direction per technique.
             depth: Surface interactions.
             seed: Base seed.
-            indirect_limit: Most radiance that one path may add behind its first vertex, or 0: no
-                limit, unbiased.
+            indirect_limit: Most radiance that each vertex behind the first may add to a path, or 0:
+                no limit, unbiased. With ``sharing``, in a pixel of ``spp`` samples.
             light_record: Filled where given, without a limit; rows are ``pixels``, `lanes` of each.
             vertex_record: The same.
             materials: In place of the scene's own (`Scene.materials_with`).
             is_recorded: Draw what a record holds also where none is given. Else the first vertex
                 picks among several directions of the light, which is less noisy.
-            sharing: Where given, ``spp`` is a mean, and samples go where radiance is noisy
-                (`warpir.render.allocation`): a pixel's depend on the others, and no record is kept.
+            sharing: Where given, ``spp`` is a mean, which `Sharing.noise` may raise, and samples go
+                where radiance is noisy: a pixel's depend on the others, and no record is kept.
         """
         if len(pixels) == 0:
             none = np.zeros((0, 3), np.float32)

@@ -44,8 +44,8 @@ def picture_ratio(
         light: From `light_args`.
         may_see_object: 1 where the object may hide the receiver, row-major, shape [H * W].
         wanted: Pixels to return at most, shape [H * W].
-        quality: Counts and seed; its limit is of what is thrown onto ground of radiance 1 or more,
-            and of darker ground a share.
+        quality: Counts and seed; of its limit `THROWN_LIMIT` is that of what is thrown onto ground
+            of radiance 1 or more, and a share of it onto darker ground.
 
     Returns:
         Row-major pixels, shape [receiver_pixel], and ratios, shape [receiver_pixel, 3].
