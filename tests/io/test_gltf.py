@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from benchmarks.damage.mutations import places
 from tests.builders.faults import assert_fails
@@ -29,6 +30,7 @@ from tests.development_data import MESHES, needs_shared
 from warpir.core.errors import InputError
 from warpir.core.limits import LIMITS, Limits
 from warpir.io.assets import load_asset
+from warpir.io.gltf.nodes import from_trs
 from warpir.io.gltf.reader import glass_notices, read_gltf
 from warpir.io.meshes.asset_files import TextureDecoder
 from warpir.scene.asset import Asset, Material, TextureSlot
@@ -1284,6 +1286,22 @@ def test_G28_M10_deep_chain_loads(builder: Builder, tmp_path: Path) -> None:
     chain = [{"children": [k + 1], "translation": [0.5, 0, 0]} for k in range(2999)]
     builder.json["nodes"] = [*chain, {"mesh": 0}]
     assert load(tmp_path, builder).bounds()[0][0] == 2999 * 0.5
+
+
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e308])
+def test_trs_is_the_product_of_its_parts(length: float) -> None:
+    """Of numbers and of rows of instances, with a quaternion of any length."""
+    rng = np.random.default_rng(5)
+    shifts, turns, scales = rng.uniform(-1.0, 1.0, (3, 6, 4))
+    shifts, scales = shifts[:, :3], scales[:, :3]
+    expected = np.zeros((6, 4, 4))
+    expected[:, :3, :3] = Rotation.from_quat(turns).as_matrix() * scales[:, None]
+    expected[:, :3, 3], expected[:, 3, 3] = shifts, 1.0
+    found = from_trs(shifts.T, length * turns.T, scales.T)
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+    for parts, matrix in zip(zip(shifts, length * turns, scales, strict=True), found, strict=True):
+        alone = from_trs(*(part.tolist() for part in parts))
+        np.testing.assert_allclose(alone, matrix, atol=1e-15)
 
 
 @pytest.mark.case("M10")

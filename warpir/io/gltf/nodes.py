@@ -92,8 +92,8 @@ def from_trs(translation: Components, rotation: Components, scale: Components) -
         rotation: Quaternions x, y, z and w of any length but 0.
         scale: Along x, y and z.
     """
-    largest = sum(abs(component) for component in rotation)
-    x, y, z, w = (component / largest for component in rotation)  # whose squares cannot overflow
+    mean = sum(0.25 * abs(component) for component in rotation)
+    x, y, z, w = (component / mean for component in rotation)  # whose squares cannot overflow
     length = (x * x + y * y + z * z + w * w) ** 0.5
     x, y, z, w = x / length, y / length, z / length, w / length
     a, b, c = scale
