@@ -2,16 +2,16 @@
 
 import hashlib
 import time
+from typing import Any
 
 import pytest
-from _pytest.mark import ParameterSet
 
 from tests.cases import cases_of
 
 NO_TIME = "no time is left for it"
 
 
-def slow(*values: object) -> list[ParameterSet]:
+def slow(*values: object) -> list[Any]:
     """Return a parameter's values with which a test is slow, beside others: ``[1, *slow(2, 3)]``.
 
     For tests that take seconds with each value, and of which one tells nearly as much as all.
